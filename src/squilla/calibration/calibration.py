@@ -1,0 +1,191 @@
+"""The calibration: everything that frames taught us about one camera, in one file."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from squilla.errors import InputError
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where the sub-images lie on the sensor, and how they move with depth.
+
+    A point at inverse depth `disparity` that the reference unit sees at p (px from the centre of
+    its field) is seen by unit i at ``centre[i] + p + disparity * baseline[i]``.
+
+    shape : (rows, columns) of the array.
+    centre : (M, 2) px, (y, x): image of an infinitely distant point on the camera's axis.
+    baseline : (M, 2) lens pitches, (y, x), zero for the reference unit.
+    reference : index of the unit whose view is reconstructed.
+    field : (H, W) px, size of the aligned sub-images.
+    focal : focal length, px.
+    pitch : distance of neighbouring lenses, mm; ``distance = pitch * focal / disparity``.
+    """
+
+    shape: tuple[int, int]
+    centre: np.ndarray
+    baseline: np.ndarray
+    reference: int
+    field: tuple[int, int]
+    focal: float
+    pitch: float
+
+    def disparity(self, distance: float) -> float:
+        """Return the disparity of a plane at `distance` mm, px per lens pitch."""
+        return self.pitch * self.focal / distance
+
+    def distance(self, disparity: float) -> float:
+        """Return the distance in mm at which a plane has this disparity (px per pitch)."""
+        return self.pitch * self.focal / max(disparity, 1e-9)
+
+    def field_angle(self) -> np.ndarray:
+        """Return the chief-ray angle of every pixel of the reference view, (H, W) rad."""
+        rows, columns = (np.arange(size) - (size - 1) / 2 for size in self.field)
+        return np.arctan(np.hypot(rows[:, None], columns[None, :]) / self.focal)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """What dark and flat frames say of every pixel of the sensor.
+
+    dark : (rows, columns) DN, float32.
+    flat : (rows, columns) relative response, float32; 1 at the response that `sensitivity` states.
+    valid : (rows, columns) bool; False for dead, hot and unlit pixels.
+    saturation : DN at and above which a pixel is not believed.
+    gain : e-/DN.  read_noise : e-.
+    """
+
+    dark: np.ndarray
+    flat: np.ndarray
+    valid: np.ndarray
+    saturation: float
+    gain: float
+    read_noise: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Everything that frames taught us about one camera.
+
+    wavelength : (K,) nm, increasing.
+    sensitivity : (A, M, K), DN per ms and unit photon radiance for a calibrated camera, any unit
+        for a matrix of one's own; one matrix for each field angle in `angle`.
+    angle : (A,) rad, increasing.
+    lattice, pixels : None when only a response matrix is known.
+    provenance : what it was made from; plain numbers and strings.
+    """
+
+    wavelength: np.ndarray
+    sensitivity: np.ndarray
+    angle: np.ndarray
+    lattice: Lattice | None = None
+    pixels: Pixels | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self):
+        expected = (len(self.angle), self.filters, len(self.wavelength))
+        if self.sensitivity.shape != expected:
+            raise InputError(
+                f"The sensitivity has shape {self.sensitivity.shape}; with {len(self.angle)} "
+                f"angles and {len(self.wavelength)} wavelengths {expected} was expected."
+            )
+        if not np.all(np.isfinite(self.sensitivity)):
+            raise InputError("The sensitivity holds NaN or infinite values; repair the table.")
+        if not np.all(np.diff(self.wavelength) > 0):
+            raise InputError("The wavelengths of a calibration must increase.")
+
+    @classmethod
+    def from_sensitivity(
+        cls, sensitivity: np.ndarray, wavelength: np.ndarray, angle: np.ndarray | None = None
+    ) -> "Calibration":
+        """Make a calibration from a response matrix alone.
+
+        Parameters
+        ----------
+        sensitivity : array, (M, K) or (A, M, K)
+        wavelength : array, (K,)
+            nm, increasing.
+        angle : array, (A,), optional
+            Field angles of a (A, M, K) sensitivity, rad.
+        """
+        sensitivity = np.asarray(sensitivity, np.float64)
+        if sensitivity.ndim == 2:
+            sensitivity = sensitivity[None]
+        if sensitivity.ndim != 3:
+            raise InputError(
+                f"A response matrix has the shape (filters, wavelengths), not {sensitivity.shape}."
+            )
+        angle = np.zeros(1) if angle is None else np.asarray(angle, float)
+        return cls(np.asarray(wavelength, float), sensitivity, angle)
+
+    @property
+    def filters(self) -> int:
+        """Number of filters, M."""
+        return self.sensitivity.shape[-2]
+
+    @cached_property
+    def mean_sensitivity(self) -> Tensor:
+        """Sensitivity averaged over the field angles, (M, K), float32."""
+        return torch.from_numpy(self.sensitivity.mean(0)).float()
+
+    @cached_property
+    def sensitivities(self) -> Tensor:
+        """Sensitivity at the angles of `angle`, (A, M, K), float32."""
+        return torch.from_numpy(self.sensitivity).float()
+
+    def angle_weights(self, angle: Tensor) -> Tensor:
+        """Return the weights that interpolate between the angles of the sensitivity.
+
+        Linear in the squared angle, because a thin film's shift is; constant beyond the ends.
+
+        Parameters
+        ----------
+        angle : Tensor, (...)
+            Field angle, rad.
+
+        Returns
+        -------
+        Tensor, (..., A), float32, non-negative, summing to 1
+        """
+        node = torch.from_numpy(np.asarray(self.angle) ** 2).float()
+        if len(node) == 1:
+            return torch.ones(*angle.shape, 1)
+        square = angle.float().square().clamp(node[0], node[-1])
+        right = torch.searchsorted(node, square.contiguous()).clamp(1, len(node) - 1)
+        weight = (square - node[right - 1]) / (node[right] - node[right - 1])
+        weights = torch.zeros(*angle.shape, len(node))
+        weights.scatter_(-1, (right - 1)[..., None], (1 - weight)[..., None])
+        return weights.scatter_(-1, right[..., None], weight[..., None])
+
+    def project(self, cube: Tensor, angle: Tensor | None = None) -> Tensor:
+        """Return what the filters measure of spectra, y = R x.
+
+        Parameters
+        ----------
+        cube : Tensor, (..., K)
+        angle : Tensor, (...), optional
+            Field angle of each spectrum, rad; without it the mean sensitivity is used.
+
+        Returns
+        -------
+        Tensor, (..., M)
+        """
+        if angle is None or len(self.angle) == 1:
+            return cube @ self.mean_sensitivity.T
+        weights = self.angle_weights(angle)
+        total = torch.zeros(*cube.shape[:-1], self.filters)
+        for node, sensitivity in enumerate(self.sensitivities):
+            total += weights[..., node, None] * (cube @ sensitivity.T)
+        return total
+
+    def on(self, wavelength: np.ndarray) -> "Calibration":
+        """Return the same calibration on another wavelength grid within its own."""
+        from squilla.spectra import resample
+
+        values = resample(self.sensitivity, self.wavelength, wavelength)
+        return replace(self, wavelength=np.asarray(wavelength, float), sensitivity=values)

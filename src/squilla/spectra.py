@@ -1,0 +1,372 @@
+"""Spectra: the measured tables that ship, random spectra to train on, resampling, colour.
+
+A spectrum here is a relative photon radiance, so that the measurement is y = R x with the
+sensitivity R = transmittance x quantum efficiency and no further factor.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files as package_files
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from squilla.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Generator, Tensor
+
+CHART_LIGHT = "LED-B3"
+"""The white LED of every evaluation scene; kept out of the training lights."""
+
+
+def grid(start: float = 500.0, stop: float = 750.0, step: float = 1.0) -> np.ndarray:
+    """Return an even wavelength grid with both ends, nm; the default is the thesis' 251 bands."""
+    return np.linspace(start, stop, round((stop - start) / step) + 1)
+
+
+# --- measured tables ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SpectralTable:
+    """Measured spectra with their names.
+
+    wavelength : (K,) nm.  values : (N, K) reflectance, 0..1 and a little above for fluorescent
+    samples, or light with its peak at 1.  name : (N,).
+    """
+
+    wavelength: np.ndarray
+    values: np.ndarray
+    name: tuple[str, ...]
+
+    def on(self, wavelength: np.ndarray) -> np.ndarray:
+        """Return the values on another grid, (N, K'); refuses to extrapolate."""
+        return resample(self.values, self.wavelength, wavelength)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.name:
+            raise InputError(f"There is no spectrum named {name!r}; there are {list(self.name)}.")
+        return self.values[self.name.index(name)]
+
+
+def _table(file: str, quantity: str) -> SpectralTable:
+    with np.load(str(package_files("squilla") / "data" / "spectra" / file)) as table:
+        return SpectralTable(
+            table["wavelength"], table[quantity].astype(np.float64), tuple(table["name"].tolist())
+        )
+
+
+@cache
+def reflectances() -> SpectralTable:
+    """Return 573 measured reflectances of paints, skin, minerals, textiles, 500-750 nm.
+
+    Source: NOTICE, spectra/reflectance_train.npz.
+    """
+    return _table("reflectance_train.npz", "reflectance")
+
+
+@cache
+def lights() -> SpectralTable:
+    """Return 629 measured or standard lights, peak 1, 500-750 nm.
+
+    Source: NOTICE, spectra/light_train.npz.
+    """
+    return _table("light_train.npz", "light")
+
+
+@cache
+def chart_reflectances() -> SpectralTable:
+    """Return the 24 patches of a ColorChecker, row by row. For evaluation only: never train on it.
+
+    Source: NOTICE, spectra/reflectance_chart.npz.
+    """
+    return _table("reflectance_chart.npz", "reflectance")
+
+
+def resample(spectrum: np.ndarray, wavelength: np.ndarray, onto: np.ndarray) -> np.ndarray:
+    """Interpolate spectra linearly onto another wavelength grid.
+
+    Parameters
+    ----------
+    spectrum : array, (..., K)
+    wavelength : array, (K,)
+        Where `spectrum` is known, nm, increasing.
+    onto : array, (K',)
+        Wanted wavelengths, nm; every one must lie within `wavelength`.
+
+    Returns
+    -------
+    array, (..., K'), of the type of `spectrum` (float64 for integers)
+
+    Raises
+    ------
+    InputError
+        If `onto` reaches beyond `wavelength`: nothing is extrapolated.
+    """
+    spectrum, wavelength = np.asarray(spectrum), np.asarray(wavelength, float)
+    onto = np.asarray(onto, float)
+    if spectrum.shape[-1] != len(wavelength):
+        raise InputError(
+            f"The spectra have {spectrum.shape[-1]} bands but {len(wavelength)} wavelengths."
+        )
+    if not np.all(np.diff(wavelength) > 0):
+        raise InputError("Wavelengths must increase from band to band; sort the bands first.")
+    slack = 1e-6
+    if onto.min() < wavelength[0] - slack or onto.max() > wavelength[-1] + slack:
+        raise InputError(
+            f"The spectra cover {wavelength[0]:g}-{wavelength[-1]:g} nm, but "
+            f"{onto.min():g}-{onto.max():g} nm is needed; nothing is extrapolated."
+        )
+    if len(wavelength) == 1:
+        return np.broadcast_to(spectrum, (*spectrum.shape[:-1], len(onto))).copy()
+    if not np.issubdtype(spectrum.dtype, np.floating):
+        spectrum = spectrum.astype(np.float64)
+    right = np.clip(np.searchsorted(wavelength, onto), 1, len(wavelength) - 1)
+    step = wavelength[right] - wavelength[right - 1]
+    weight = np.clip((onto - wavelength[right - 1]) / step, 0, 1).astype(spectrum.dtype)
+    return spectrum[..., right - 1] * (1 - weight) + spectrum[..., right] * weight
+
+
+# --- random spectra -------------------------------------------------------------------------
+
+
+def gaussian_mixtures(
+    count: int,
+    wavelength: np.ndarray,
+    *,
+    fewest: Literal[1, 2] = 1,
+    normalise: Literal["max", "minmax"] = "max",
+    generator: "Generator | None" = None,
+) -> "Tensor":
+    """Draw the thesis' training spectra: sums of a few Gaussian lines.
+
+    The number of lines is geometric with p = 0.3, plus one; centres are whole nanometres, uniform
+    over the grid; heights uniform on 0..1; FWHM uniform on 2..50 nm.
+
+    Parameters
+    ----------
+    count : int
+    wavelength : array, (K,)
+        nm.
+    fewest : 1 or 2
+        Whether the geometric number counts from 0 (at least one line, the default) or from 1; the
+        thesis does not say.
+    normalise : "max" or "minmax"
+        Whether "normalised" means divided by the maximum (default) or stretched so that the
+        minimum becomes 0 too; the thesis does not say.
+    generator : torch.Generator, optional
+
+    Returns
+    -------
+    Tensor, (count, K), float32, 0..1
+
+    Source: thesis, section on training data.
+    """
+    import torch
+
+    success = torch.rand(count, generator=generator).clamp_min(1e-12)
+    lines = (success.log() / np.log(0.7)).floor().long() + fewest
+    most = int(lines.max())
+    low, high = round(float(wavelength[0])), round(float(wavelength[-1]))
+    centre = torch.randint(low, high + 1, (count, most), generator=generator).float()
+    height = torch.rand(count, most, generator=generator)
+    height = height * (torch.arange(most) < lines[:, None])
+    fwhm = 2 + 48 * torch.rand(count, most, generator=generator)
+    return scaled(_sum_of_lines(wavelength, centre, height, fwhm), normalise)
+
+
+def line_spectra(
+    count: int,
+    wavelength: np.ndarray,
+    *,
+    fwhm: tuple[float, float] = (1.0, 30.0),
+    most: int = 3,
+    generator: "Generator | None" = None,
+) -> "Tensor":
+    """Draw spectra of lasers and single-colour LEDs: one to `most` lines on a dark ground.
+
+    Parameters
+    ----------
+    fwhm : (float, float)
+        Line width, nm, drawn uniformly in its logarithm: lasers 1-5, LEDs 10-30.
+
+    Returns
+    -------
+    Tensor, (count, K), float32, peak 1
+    """
+    import torch
+
+    lines = torch.randint(1, most + 1, (count,), generator=generator)
+    low, high = float(wavelength[0]), float(wavelength[-1])
+    centre = low + (high - low) * torch.rand(count, most, generator=generator)
+    height = 0.2 + 0.8 * torch.rand(count, most, generator=generator)
+    height = height * (torch.arange(most) < lines[:, None])
+    ratio = torch.rand(count, most, generator=generator)
+    width = fwhm[0] * (fwhm[1] / fwhm[0]) ** ratio
+    return scaled(_sum_of_lines(wavelength, centre, height, width))
+
+
+def natural_spectra(
+    count: int, wavelength: np.ndarray, *, generator: "Generator | None" = None
+) -> "Tensor":
+    """Draw spectra as objects show them: a measured reflectance under a measured light.
+
+    Two reflectances are mixed in a random proportion, half of the time with a white gloss; the
+    evaluation light (`CHART_LIGHT`) is left out.
+
+    Returns
+    -------
+    Tensor, (count, K), float32, peak 1
+    """
+    import torch
+
+    surface = torch.from_numpy(reflectances().on(wavelength)).float()
+    keep = [name != CHART_LIGHT for name in lights().name]
+    light = torch.from_numpy(lights().on(wavelength)[keep]).float()
+    pick = torch.randint(len(surface), (2, count), generator=generator)
+    share = torch.rand(count, 1, generator=generator) ** 2
+    reflectance = (1 - share) * surface[pick[0]] + share * surface[pick[1]]
+    gloss = 0.3 * (torch.rand(count, 1, generator=generator) - 0.5).clamp_min(0)
+    lamp = light[torch.randint(len(light), (count,), generator=generator)]
+    return scaled((reflectance + gloss) * lamp)
+
+
+def broad_spectra(
+    count: int, wavelength: np.ndarray, *, generator: "Generator | None" = None
+) -> "Tensor":
+    """Draw from the broad prior: 60 % natural, 25 % Gaussian mixtures, 15 % lines, shuffled.
+
+    Returns
+    -------
+    Tensor, (count, K), float32, peak 1
+    """
+    import torch
+
+    gaussian, line = round(0.25 * count), round(0.15 * count)
+    parts = [
+        natural_spectra(count - gaussian - line, wavelength, generator=generator),
+        gaussian_mixtures(gaussian, wavelength, generator=generator),
+        line_spectra(line, wavelength, generator=generator),
+    ]
+    return torch.cat(parts)[torch.randperm(count, generator=generator)]
+
+
+PRIORS: dict[str, Callable[..., "Tensor"]] = {
+    "gaussian": gaussian_mixtures,
+    "natural": natural_spectra,
+    "line": line_spectra,
+    "broad": broad_spectra,
+}
+"""The kinds of random spectra by name; each is called as ``f(count, wavelength, generator=)``."""
+
+
+def scaled(spectrum: "Tensor", normalise: Literal["max", "minmax"] = "max") -> "Tensor":
+    """Scale each spectrum, (..., K), to a maximum of 1 (and, for "minmax", a minimum of 0)."""
+    if normalise == "minmax":
+        spectrum = spectrum - spectrum.amin(-1, keepdim=True)
+    return spectrum / spectrum.amax(-1, keepdim=True).clamp_min(1e-12)
+
+
+def _sum_of_lines(
+    wavelength: np.ndarray, centre: "Tensor", height: "Tensor", fwhm: "Tensor"
+) -> "Tensor":
+    """Sum Gaussian lines, each parameter (N, lines), into spectra (N, K)."""
+    import torch
+
+    position = torch.as_tensor(np.asarray(wavelength), dtype=torch.float32)
+    total = torch.zeros(len(centre), len(position))
+    for line in range(centre.shape[1]):  # a loop, for the whole (N, lines, K) would not fit
+        offset = (position - centre[:, line, None]) / fwhm[:, line, None]
+        total += height[:, line, None] * torch.exp(-4 * np.log(2) * offset**2)
+    return total
+
+
+# --- colour ---------------------------------------------------------------------------------
+
+
+def rgb(
+    cube: np.ndarray,
+    wavelength: np.ndarray,
+    *,
+    white: np.ndarray | None = None,
+    exposure: float | None = None,
+) -> np.ndarray:
+    """Return the colour that the CIE 1931 observer sees in a cube, as sRGB.
+
+    Wavelengths outside the cube's band add nothing; adapting to `white`, which is cut to the same
+    band, keeps white things white.
+
+    Parameters
+    ----------
+    cube : array, (..., K)
+        Photon radiance, any scale.
+    wavelength : array, (K,)
+        nm, increasing.
+    white : array, (K,), optional
+        Spectrum that shall look white; the light of the scene. Default: equal at all wavelengths.
+    exposure : float, optional
+        Luminance relative to `white` that becomes 1; default: the 99th percentile of the cube.
+
+    Returns
+    -------
+    array, (..., 3), 0..1, gamma encoded
+
+    Source: CIE 015:2018 through colour-science; Bradford adaptation to D65.
+    """
+    import colour
+
+    wavelength = np.asarray(wavelength, float)
+    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    matching = np.stack(
+        [np.interp(wavelength, observer.wavelengths, channel) for channel in observer.values.T], -1
+    )
+    step = np.gradient(wavelength) if len(wavelength) > 1 else np.ones(1)
+    matching = matching * (step / wavelength)[:, None]  # photons to power
+    white = np.ones(len(wavelength)) if white is None else np.asarray(white, float)
+    white_xyz = white @ matching
+    xyz = np.nan_to_num(np.asarray(cube)) @ matching / white_xyz[1]
+    if exposure is None:
+        exposure = float(np.percentile(xyz[..., 1], 99))
+    xyz = xyz / max(exposure, 1e-12)
+    # Von Kries scaling in Bradford's cone space, written out so that the blue channel, nearly
+    # empty in a band that begins at 500 nm, cannot divide by zero.
+    cone = colour.adaptation.CHROMATIC_ADAPTATION_TRANSFORMS["Bradford"]
+    d65 = colour.xy_to_XYZ(colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"])
+    gain = (cone @ d65) / np.maximum(cone @ (white_xyz / white_xyz[1]), 1e-6)
+    adapted = xyz @ (np.linalg.inv(cone) @ np.diag(gain) @ cone).T
+    linear = np.clip(
+        adapted @ np.asarray(colour.models.RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB).T, 0, 1
+    )
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def composite(
+    cube: np.ndarray,
+    wavelength: np.ndarray,
+    bands: tuple[float, float, float] = (650.0, 550.0, 500.0),
+    *,
+    scale: float | None = None,
+) -> np.ndarray:
+    """Return three bands as red, green and blue: the thesis' picture of a cube.
+
+    Parameters
+    ----------
+    cube : array, (..., K)
+    wavelength : array, (K,)
+        nm.
+    bands : (float, float, float)
+        Wavelengths shown as red, green, blue, nm; the nearest bands are taken.
+    scale : float, optional
+        Radiance that becomes 1; default: the 99.5th percentile of the three bands.
+
+    Returns
+    -------
+    array, (..., 3), 0..1
+
+    Source: thesis, figures 5.1 to 5.5.
+    """
+    picture = np.asarray(cube)[..., [int(np.abs(wavelength - band).argmin()) for band in bands]]
+    scale = float(np.percentile(picture, 99.5)) if scale is None else scale
+    return np.clip(np.nan_to_num(picture) / max(scale, 1e-12), 0, 1)
