@@ -113,6 +113,8 @@ def resample(spectrum: np.ndarray, wavelength: np.ndarray, onto: np.ndarray) -> 
         )
     if not np.all(np.diff(wavelength) > 0):
         raise InputError("Wavelengths must increase from band to band; sort the bands first.")
+    if np.array_equal(onto, wavelength):
+        return spectrum
     slack = 1e-6
     if onto.min() < wavelength[0] - slack or onto.max() > wavelength[-1] + slack:
         raise InputError(
