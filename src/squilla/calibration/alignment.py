@@ -118,7 +118,7 @@ def correct(raw: Raw, pixels: Pixels) -> tuple[np.ndarray, np.ndarray]:
         Saturated or defective pixels.
     """
     bad = ~pixels.valid | (raw.frame >= pixels.saturation)
-    corrected = (raw.frame - pixels.dark) / pixels.flat
+    corrected = (raw.frame - pixels.dark(raw.exposure)) / pixels.flat
     rows, columns = np.nonzero(bad & (pixels.flat > 0))
     if 0 < len(rows) < bad.size // 100:  # single pixels; whole areas have no neighbours to take
         near = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
@@ -148,7 +148,7 @@ def judge_exposure(raw: Raw, lattice: Lattice, pixels: Pixels) -> None:
 
 def measured_snr(raw: Raw, lattice: Lattice, pixels: Pixels) -> float:
     """Return the signal-to-noise ratio of a frame's sub-images by the calibrated noise, dB."""
-    _, signal = windows(raw.frame - pixels.dark, lattice, 0)
+    _, signal = windows(raw.frame - pixels.dark(raw.exposure), lattice, 0)
     noise = (signal.mean() / pixels.gain).clamp_min(0) + (pixels.read_noise / pixels.gain) ** 2
     noise = float(noise) + 1 / 12
     power = float(signal.square().mean()) - noise
@@ -184,10 +184,10 @@ def _fitting(raw: Raw, calibration: Calibration) -> tuple[Lattice, Pixels]:
             "This calibration knows a response matrix but no camera geometry; raw frames need one "
             "made by `squilla calibrate`."
         )
-    if raw.frame.shape != pixels.dark.shape:
+    if raw.frame.shape != pixels.bias.shape:
         raise InputError(
             f"The raw frame has {raw.frame.shape[0]} x {raw.frame.shape[1]} px, the calibration "
-            f"was made for {pixels.dark.shape[0]} x {pixels.dark.shape[1]}: they are of different "
+            f"was made for {pixels.bias.shape[0]} x {pixels.bias.shape[1]}: they are of different "
             "cameras or regions."
         )
     taken, made = raw.metadata.get("camera"), calibration.provenance.get("camera")

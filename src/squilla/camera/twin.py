@@ -84,7 +84,7 @@ class Camera:
     def angles(self) -> np.ndarray:
         """Field angles between which filters and blur are interpolated, (A,) rad.
 
-        Evenly in the squared angle: four up to the field's corner, two beyond, to the last lit pixel.
+        Evenly in the squared angle: four up to the field's corner, two beyond, to the last lit one.
         """
         size = np.array([self.design.field.size / np.sqrt(2), self._farthest])
         corner, last = np.arctan(size / self.design.focal) ** 2
