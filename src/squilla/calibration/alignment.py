@@ -9,6 +9,7 @@ step up and a step down.
 from dataclasses import dataclass, field
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -20,6 +21,9 @@ from squilla.files.raw import Raw
 
 _TAPS = 8
 """Length of the resampling filter, px."""
+
+_TEXTURED = 0.1
+"""Mean correlation of the sub-images' edges below which they show the same thing by chance."""
 
 
 @dataclass(frozen=True)
@@ -68,22 +72,21 @@ def measure(
         saturated.
     """
     lattice, pixels = _fitting(raw, calibration)
-    corrected, bad = correct(raw, pixels)
-    judge_exposure(raw, lattice, pixels)
-    if distance is None:
-        margin = int(np.ceil(lattice.disparity(nearest) * np.abs(lattice.baseline).max())) + 2
-        margin = min(margin, 64)
-        origin, images = windows(corrected, lattice, margin)
-        offset = lattice.centre - origin - (np.array(lattice.field) - 1) / 2 - margin
-        disparity, score = find_disparity(
-            edges(images), offset, lattice.baseline, margin, lattice.disparity(nearest)
-        )
+    farthest = float(np.abs(lattice.baseline).max())
+    margin = int(np.ceil(lattice.disparity(min(nearest, distance or nearest)) * farthest)) + _TAPS
+    views = sub_images(raw, lattice, pixels, margin)
+    snr = _judge(views, raw, pixels)
+    score = 1.0
+    if distance is not None:
+        disparity, how = lattice.disparity(distance), "from the given distance"
     else:
-        disparity, score = lattice.disparity(distance), float("nan")
-    textured = not score < 0.05
-    if not textured:
-        disparity = 0.0
-    y, valid = align(corrected, bad, lattice, disparity)
+        disparity, score = find_disparity(
+            edges(views.image), views.offset, lattice.baseline, lattice.disparity(nearest)
+        )
+        how = "from the scene"
+        if score < _TEXTURED:
+            disparity, how = lattice.disparity(lattice.usual), "no texture: at the usual distance"
+    y, valid = align(views, lattice, disparity)
     y = y / (raw.exposure or 1.0)
     shape = lattice.field
     return Measurement(
@@ -91,90 +94,124 @@ def measure(
         valid,
         torch.from_numpy(lattice.field_angle()).float(),
         torch.full(shape, float(disparity)),
-        measured_snr(raw, lattice, pixels),
+        snr,
         {
             "camera": raw.metadata.get("camera", "unknown"),
             "exposure": raw.exposure or 0.0,
-            "disparity": float(disparity),
-            "alignment_score": float(score),
-            "alignment": "from the scene" if textured and distance is None
-            else "from the given distance" if distance is not None
-            else "no texture: taken as far away",
+            "disparity": disparity,
+            "distance": lattice.distance(disparity),
+            "alignment": how,
+            "alignment_score": score,
         },
-    )  # fmt: skip
+    )
 
 
 # --- correction -------------------------------------------------------------------------------
 
 
-def correct(raw: Raw, pixels: Pixels) -> tuple[np.ndarray, np.ndarray]:
-    """Subtract the dark and divide by the flat; fill bad pixels from their neighbours.
+@dataclass(frozen=True)
+class SubImages:
+    """Every unit's field with a margin around, corrected, not yet aligned.
 
-    Returns
-    -------
-    corrected : array, (rows, columns) float32
-        DN.
-    bad : array, (rows, columns) bool
-        Saturated or defective pixels.
+    image : Tensor, (M, H + 2 margin, W + 2 margin) float32, DN.
+    bad : Tensor of the same shape, bool; saturated, defective or outside the sensor.
+    offset : (M, 2) px; where in its image each unit sees an infinitely distant point on the axis,
+        against the middle.
+    margin : px.
+    saturated : share of saturated pixels.
     """
-    bad = ~pixels.valid | (raw.frame >= pixels.saturation)
-    corrected = (raw.frame - pixels.dark(raw.exposure)) / pixels.flat
-    rows, columns = np.nonzero(bad & (pixels.flat > 0))
-    if 0 < len(rows) < bad.size // 100:  # single pixels; whole areas have no neighbours to take
+
+    image: Tensor
+    bad: Tensor
+    offset: np.ndarray
+    margin: int
+    saturated: float
+
+
+def sub_images(raw: Raw, lattice: Lattice, pixels: Pixels, margin: int) -> SubImages:
+    """Cut the sub-images out of a frame, subtract the dark, divide by the flat.
+
+    Bad pixels are filled with the mean of their good neighbours.
+    """
+    origin, frame = windows(raw.frame, lattice, margin)
+    flat, valid = (
+        windows(pixels.flat, lattice, margin)[1],
+        windows(pixels.valid, lattice, margin)[1],
+    )
+    bias = windows(pixels.bias, lattice, margin)[1]
+    rate = windows(pixels.dark_rate, lattice, margin)[1]
+    image = np.empty(frame.shape, np.float32)
+    bad = np.empty(frame.shape, bool)
+    exposure = np.float32(raw.exposure or 0.0)
+    _correct(frame, bias, rate, exposure, flat, valid, np.float32(pixels.saturation), image, bad)
+    unit, row, column = np.nonzero(bad)
+    if len(unit) < bad.size // 100:  # single pixels; whole areas have no neighbours to take
         near = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
-        y = np.clip(rows[:, None] + near[:, 0], 0, bad.shape[0] - 1)
-        x = np.clip(columns[:, None] + near[:, 1], 0, bad.shape[1] - 1)
-        good = ~bad[y, x]
-        total = np.where(good, corrected[y, x], 0).sum(1)
-        corrected[rows, columns] = total / np.maximum(good.sum(1), 1)
-    return corrected, bad
+        y = np.clip(row[:, None] + near[:, 0], 0, bad.shape[1] - 1)
+        x = np.clip(column[:, None] + near[:, 1], 0, bad.shape[2] - 1)
+        good = ~bad[unit[:, None], y, x]
+        total = np.where(good, image[unit[:, None], y, x], 0).sum(1)
+        image[unit, row, column] = total / np.maximum(good.sum(1), 1)
+    offset = lattice.centre - origin - (np.array(lattice.field) - 1) / 2 - margin
+    saturated = float(np.mean(_inner(frame, margin) >= pixels.saturation))
+    return SubImages(torch.from_numpy(image), torch.from_numpy(bad), offset, margin, saturated)
 
 
-def judge_exposure(raw: Raw, lattice: Lattice, pixels: Pixels) -> None:
-    """Raise InputError if the frame is mostly saturated or dark."""
-    _, frame = windows(raw.frame.astype(np.float32), lattice, 0)
-    saturated = float((frame >= pixels.saturation).float().mean())
-    if saturated > 0.5:
-        raise InputError(
-            f"{100 * saturated:.0f} % of the frame is saturated; expose shorter or dim the light."
-        )
-    snr = measured_snr(raw, lattice, pixels)
-    if not snr > 0:
-        raise InputError(
-            "The frame is dark: its signal does not rise above the noise; expose longer, open the "
-            "stop or check the lens cover."
-        )
+@numba.njit(parallel=True, cache=True)
+def _correct(frame, bias, rate, exposure, flat, valid, saturation, image, bad):
+    units, rows, columns = frame.shape
+    for line in numba.prange(units * rows):
+        unit, row = line // rows, line % rows
+        for column in range(columns):
+            level = np.float32(frame[unit, row, column])
+            dark = bias[unit, row, column] + exposure * rate[unit, row, column]
+            wrong = not valid[unit, row, column] or level >= saturation
+            bad[unit, row, column] = wrong
+            image[unit, row, column] = (level - dark) / flat[unit, row, column] if not wrong else 0
 
 
-def measured_snr(raw: Raw, lattice: Lattice, pixels: Pixels) -> float:
-    """Return the signal-to-noise ratio of a frame's sub-images by the calibrated noise, dB."""
-    _, signal = windows(raw.frame - pixels.dark(raw.exposure), lattice, 0)
-    noise = (signal.mean() / pixels.gain).clamp_min(0) + (pixels.read_noise / pixels.gain) ** 2
-    noise = float(noise) + 1 / 12
-    power = float(signal.square().mean()) - noise
-    return float(10 * np.log10(max(power, 1e-9) / noise))
-
-
-def windows(image: np.ndarray, lattice: Lattice, margin: int) -> tuple[np.ndarray, Tensor]:
+def windows(image: np.ndarray, lattice: Lattice, margin: int) -> tuple[np.ndarray, np.ndarray]:
     """Cut every unit's field out of a frame, at whole pixels.
 
     Returns
     -------
     origin : array, (M, 2) int
         Frame position of each window's first pixel.
-    images : Tensor, (M, H + 2 margin, W + 2 margin); zero outside the sensor.
+    images : array, (M, H + 2 margin, W + 2 margin); zero outside the sensor.
     """
     half = (np.array(lattice.field) - 1) / 2
     origin = np.floor(lattice.centre - half).astype(int) - margin
     height, width = (size + 2 * margin for size in lattice.field)
-    images = np.zeros((len(origin), height, width), np.float32)
-    for image_of_unit, (y, x) in zip(images, origin, strict=True):
-        rows = slice(max(y, 0), min(y + height, image.shape[0]))
-        columns = slice(max(x, 0), min(x + width, image.shape[1]))
-        image_of_unit[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x] = image[
-            rows, columns
-        ]
-    return origin, torch.from_numpy(images)
+    images = np.zeros((len(origin), height, width), image.dtype)
+    for window, (y, x) in zip(images, origin, strict=True):
+        top, left = max(y, 0), max(x, 0)
+        part = image[top : max(y + height, 0), left : max(x + width, 0)]
+        window[top - y : top - y + part.shape[0], left - x : left - x + part.shape[1]] = part
+    return origin, images
+
+
+def _inner(images, margin: int):
+    """Return pictures without their margin."""
+    return images[:, margin : images.shape[1] - margin, margin : images.shape[2] - margin]
+
+
+def _judge(views: SubImages, raw: Raw, pixels: Pixels) -> float:
+    """Return the signal-to-noise ratio of sub-images, dB; InputError if it is no picture."""
+    if views.saturated > 0.5:
+        raise InputError(
+            f"{100 * views.saturated:.0f} % of the frame is saturated; expose shorter or dim the "
+            "light."
+        )
+    good = _inner(views.image, views.margin)[~_inner(views.bad, views.margin)]
+    shot = float(good.mean().clamp_min(0)) / pixels.gain if len(good) else 0.0
+    noise = shot + (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
+    power = float(good.square().mean()) - noise if len(good) else 0.0
+    if power <= noise:
+        raise InputError(
+            "The frame is dark: its signal does not rise above the noise; expose longer, open the "
+            "stop or check the lens cover."
+        )
+    return float(10 * np.log10(power / noise))
 
 
 def _fitting(raw: Raw, calibration: Calibration) -> tuple[Lattice, Pixels]:
@@ -245,7 +282,7 @@ def _taper(size: int, share: float = 0.1) -> Tensor:
 
 
 def find_disparity(
-    features: Tensor, offset: np.ndarray, baseline: np.ndarray, margin: int, largest: float
+    features: Tensor, offset: np.ndarray, baseline: np.ndarray, largest: float
 ) -> tuple[float, float]:
     """Find the disparity of a plane from all sub-images at once.
 
@@ -262,8 +299,6 @@ def find_disparity(
         Where each unit sees an infinitely distant point, against the reference pixel grid, px.
     baseline : array, (M, 2)
         Lens pitches.
-    margin : int
-        Largest shift looked for, px.
     largest : float
         Largest disparity looked for, px per pitch.
 
@@ -280,9 +315,7 @@ def find_disparity(
     step = 0.25 / max(float(np.abs(baseline).max()), 1e-9)
     candidates = np.arange(-4 * step, largest + step, step)
     shifts = offset - offset[reference] + candidates[:, None, None] * baseline  # (D, M, 2)
-    inside = np.abs(shifts).max(-1) < margin + 2
-    sampled = _sample_periodic(surfaces, torch.from_numpy(shifts).float())
-    total = torch.where(torch.from_numpy(inside), sampled, 0.0).sum(1)
+    total = _sample_periodic(surfaces, torch.from_numpy(shifts).float()).sum(1)
     disparity = float(candidates[int(total.argmax())])
     direction = torch.from_numpy(baseline).float()
     for _ in range(6):
@@ -395,19 +428,15 @@ def _peak(spectra: Tensor, position: Tensor, reference: int, reach: int = 12) ->
 # --- resampling -------------------------------------------------------------------------------
 
 
-def align(
-    corrected: np.ndarray, bad: np.ndarray, lattice: Lattice, disparity: float
-) -> tuple[Tensor, Tensor]:
+def align(views: SubImages, lattice: Lattice, disparity: float) -> tuple[Tensor, Tensor]:
     """Resample every sub-image onto the reference view, once.
 
     Parameters
     ----------
-    corrected : array, (rows, columns)
-        Of `correct`.
-    bad : array, (rows, columns) bool
+    views : SubImages
     lattice : Lattice
     disparity : float
-        px per lens pitch.
+        px per lens pitch; no more than the margin of `views` allows.
 
     Returns
     -------
@@ -419,34 +448,24 @@ def align(
     A separable windowed sinc of 8 taps (Kaiser, beta 5): its response at half a pixel's shift is
     within 1 % of one up to 0.35 cycles per px.
     """
-    half = (np.array(lattice.field) - 1) / 2
-    start = lattice.centre + disparity * lattice.baseline - half
+    start = views.margin + views.offset + disparity * lattice.baseline
     first = np.floor(start).astype(int)
-    fraction = start - first
+    kernel = sinc_kernel(torch.from_numpy(start - first).float())
     before = _TAPS // 2 - 1
     height, width = lattice.field
-    y = np.zeros((len(start), height + _TAPS - 1, width + _TAPS - 1), np.float32)
-    valid = np.zeros((len(start), height, width), bool)
+    cut, valid = [], []
     for unit, (row, column) in enumerate(first):
-        rows = np.arange(row - before, row - before + y.shape[1])
-        columns = np.arange(column - before, column - before + y.shape[2])
-        inside = np.ix_(
-            (rows >= 0) & (rows < bad.shape[0]), (columns >= 0) & (columns < bad.shape[1])
-        )
-        at = np.ix_(np.clip(rows, 0, bad.shape[0] - 1), np.clip(columns, 0, bad.shape[1] - 1))
-        y[unit] = corrected[at]
-        good = np.zeros(y.shape[1:], bool)
-        good[inside] = True
-        good &= ~bad[at]
+        rows = slice(row - before, row - before + height + _TAPS - 1)
+        columns = slice(column - before, column - before + width + _TAPS - 1)
+        cut.append(views.image[unit, rows, columns])
         # A pixel is believed if the four around its position are.
-        near = good[before : before + height + 1, before : before + width + 1]
-        valid[unit] = near[:-1, :-1] & near[1:, :-1] & near[:-1, 1:] & near[1:, 1:]
-    kernel = sinc_kernel(torch.from_numpy(fraction).float())
+        near = ~views.bad[unit, row : row + height + 1, column : column + width + 1]
+        valid.append(near[:-1, :-1] & near[1:, :-1] & near[:-1, 1:] & near[1:, 1:])
+    image = torch.stack(cut)[None]
     units = len(start)
-    image = torch.from_numpy(y)[None]
     image = functional.conv2d(image, kernel[:, 0, None, :, None], groups=units)
     image = functional.conv2d(image, kernel[:, 1, None, None, :], groups=units)
-    return image[0].permute(1, 2, 0).contiguous(), torch.from_numpy(valid).permute(1, 2, 0)
+    return image[0].permute(1, 2, 0).contiguous(), torch.stack(valid, -1)
 
 
 def sinc_kernel(fraction: Tensor) -> Tensor:

@@ -58,7 +58,7 @@ def calibrate(
     saturation = 0.98 * (2**design.sensor.bits - 1)
     light = flats.mean - darks.at(flats.exposure)
     lattice = lattice_from_flat(light, design)
-    if np.mean(windows(flats.mean, lattice, 0)[1].numpy() >= saturation) > 1e-3:
+    if np.mean(windows(flats.mean, lattice, 0)[1] >= saturation) > 1e-3:
         raise InputError("The flat frames are saturated; shorten their exposure.")
     score = float("nan")
     if target is not None:
@@ -71,11 +71,11 @@ def calibrate(
     gain, read_noise = noise_of(darks.shortest, flats, lit)
 
     rough = Zones(lattice, lit)
-    surface = rough.surface(lattice, rough(light), light.shape)
+    surface = rough.surface(lattice, rough(light.__getitem__), light.shape)
     relative = np.where(lit, light / np.maximum(surface, 1e-6), 1.0).astype(np.float32)
     valid = ~defective(darks.at(flats.exposure), relative, lit)
     zones = Zones(lattice, valid)
-    surface = zones.surface(lattice, zones(light), light.shape)
+    surface = zones.surface(lattice, zones(light.__getitem__), light.shape)
     relative = np.where(valid, light / np.maximum(surface, 1e-6), 1.0).astype(np.float32)
 
     wavelength, bandwidth, response = sweep_responses(sweep, darks, relative, saturation, zones)
@@ -92,7 +92,7 @@ def calibrate(
             "sweep_steps": len(wavelength),
             "target_distance": target_distance or 0.0,
             "target_score": score,
-            "bad_pixels": int((~windows(valid, lattice, 0)[1].bool()).sum()),
+            "bad_pixels": int((~windows(valid, lattice, 0)[1]).sum()),
         },
     )
 

@@ -26,6 +26,7 @@ class Lattice:
     focal : focal length, px.
     pitch : nominal distance of neighbouring lenses, px.
     pixel : size of a pixel, um; gives distances their scale.
+    usual : distance at which a scene without texture is taken to be, mm.
     """
 
     shape: tuple[int, int]
@@ -36,6 +37,7 @@ class Lattice:
     focal: float
     pitch: float
     pixel: float
+    usual: float
 
     def disparity(self, distance: float) -> float:
         """Return the disparity of a plane at `distance` mm, px per lens pitch."""

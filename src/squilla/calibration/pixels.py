@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
 
+import numba
 import numpy as np
 
 from squilla.errors import InputError
@@ -32,21 +33,32 @@ class Stack:
         InputError
             If there is no frame, or they differ in size.
         """
-        count, exposure, mean, squares = 0, None, np.zeros(()), np.zeros(())
+        count, first, exposure = 0, None, None
+        total = squares = np.zeros((0, 0), np.float32)
         for raw in raws:
-            if count and raw.frame.shape != mean.shape:
+            if first is None:  # what is summed is the small difference to it: float32 is enough
+                first = raw.frame
+                total, squares = np.zeros((2, *first.shape), np.float32)
+            if raw.frame.shape != first.shape:
                 raise InputError(
-                    f"The {kind} frames differ in size: {mean.shape} and {raw.frame.shape}."
+                    f"The {kind} frames differ in size: {first.shape} and {raw.frame.shape}."
                 )
-            frame = raw.frame.astype(np.float32)
+            _accumulate(raw.frame, first, total, squares)
             count, exposure = count + 1, raw.exposure
-            step = frame - mean
-            mean = mean + step / count
-            squares = squares + step * (frame - mean)
-        if count == 0:
+        if first is None:
             raise InputError(f"There is no {kind} frame; at least one is needed, better eight.")
-        variance = (squares / (count - 1)).astype(np.float32) if count > 1 else None
-        return cls(mean.astype(np.float32), variance, exposure)
+        mean = total / count
+        variance = (squares - count * mean**2) / (count - 1) if count > 1 else None
+        return cls(first + mean, variance, exposure)
+
+
+@numba.njit(parallel=True, cache=True)
+def _accumulate(frame, first, total, squares):
+    for row in numba.prange(frame.shape[0]):
+        for column in range(frame.shape[1]):
+            step = np.float32(frame[row, column]) - np.float32(first[row, column])
+            total[row, column] += step
+            squares[row, column] += step * step
 
 
 @dataclass(frozen=True)

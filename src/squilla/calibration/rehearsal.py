@@ -71,19 +71,16 @@ class Rehearsal:
 
     def flat(self) -> Iterator[Raw]:
         """Yield frames of an evenly lit white surface."""
-        exposure = self._exposure(self.camera.flat_rate(self._light))
+        rate = self.camera.flat_rate(self._light)
         for number in range(self.frames):
-            yield self.camera.capture_flat(
-                self._light, exposure, generator=self._generator(2, number)
-            )
+            yield self.camera.expose(rate, self._exposure(rate), self._generator(2, number))
 
     def sweep(self) -> Iterator[SweepStep]:
         """Yield flat frames in narrow-band light, each exposed to the same level."""
         for number, wavelength in enumerate(self.wavelengths):
             generator = self._generator(3, number)
-            band = self._band(wavelength)
-            exposure = self._exposure(self.camera.flat_rate(band))
-            raw = self.camera.capture_flat(band, exposure, generator=generator)
+            rate = self.camera.flat_rate(self._band(wavelength))
+            raw = self.camera.expose(rate, self._exposure(rate), generator)
             error = self.power_error * float(torch.randn(1, generator=generator))
             yield SweepStep(raw, float(wavelength), 1.0 + error, self.bandwidth)
 
@@ -91,12 +88,7 @@ class Rehearsal:
         """Return a frame of a textured poster at `distance`, facing the camera."""
         scene = poster(self.camera.design.field.size + 100, self.camera.design.wavelength)
         rate = self.camera.rate(scene, distance=self.distance)
-        return self.camera.capture(
-            scene,
-            distance=self.distance,
-            exposure=self._exposure(rate),
-            generator=self._generator(4, 0),
-        )
+        return self.camera.expose(rate, self._exposure(rate), self._generator(4, 0))
 
     def _band(self, wavelength: float) -> np.ndarray:
         """Return the light of one step, (K,); all of it together, also beyond the band, is 1."""

@@ -1,6 +1,6 @@
 """The sensitivity R(wavelength, field angle) from a narrow-band sweep of flat frames."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +9,8 @@ from squilla.calibration.calibration import Lattice
 from squilla.calibration.pixels import Darks
 from squilla.errors import InputError
 from squilla.files.raw import Raw
+
+Window = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
@@ -69,10 +71,16 @@ class Zones:
         hats = [np.interp(square, nodes, unit) for unit in np.eye(len(nodes))]
         return np.stack(hats, -1)
 
-    def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Return the response at the nodes, (A, M), of a corrected frame (rows, columns)."""
+    def __call__(self, corrected: Callable[[Window], np.ndarray]) -> np.ndarray:
+        """Return the response at the nodes, (A, M).
+
+        Parameters
+        ----------
+        corrected : function
+            Gives the corrected frame within a window, a pair of slices.
+        """
         fitted = [
-            fit @ image[window].ravel()
+            fit @ corrected(window).ravel()
             for fit, window in zip(self._fits, self._windows, strict=True)
         ]
         return np.stack(fitted, -1)
@@ -123,7 +131,6 @@ def sweep_responses(
         DN per ms and unit of power.
     """
     rows = []
-    reciprocal = 1 / flat
     for step in steps:
         if not step.power > 0 or step.raw.exposure is None:
             raise InputError(
@@ -133,8 +140,13 @@ def sweep_responses(
             raise InputError(
                 f"The sweep frame at {step.wavelength:g} nm is saturated; shorten its exposure."
             )
-        response = zones((step.raw.frame - darks.at(step.raw.exposure)) * reciprocal)
-        rows.append((step.wavelength, step.bandwidth, response / step.power / step.raw.exposure))
+        frame, exposure = step.raw.frame, np.float32(step.raw.exposure)
+        response = zones(
+            lambda at, frame=frame, exposure=exposure: (
+                (frame[at] - darks.bias[at] - exposure * darks.rate[at]) / flat[at]
+            )
+        )
+        rows.append((step.wavelength, step.bandwidth, response / (step.power * exposure)))
     if len(rows) < 2:
         raise InputError("A sweep needs at least two wavelengths.")
     rows.sort(key=lambda row: row[0])

@@ -195,17 +195,17 @@ class Camera:
         rate = self.rate(scene, distance=distance, depth=depth)
         if snr is not None:
             exposure = self.sensor.exposure_for(self._fields(rate), snr)
-        return self._expose(rate, exposure, generator)
+        return self.expose(rate, exposure, generator)
 
     def capture_flat(
         self, light: np.ndarray, exposure: float, *, generator: Generator | None = None
     ) -> Raw:
         """Take a frame of an evenly lit surface that fills every view, spectrum `light` (K,)."""
-        return self._expose(self.flat_rate(light), exposure, generator)
+        return self.expose(self.flat_rate(light), exposure, generator)
 
     def capture_dark(self, exposure: float, *, generator: Generator | None = None) -> Raw:
         """Take a frame with the lens covered."""
-        return self._expose(np.zeros(self.design.sensor_shape, np.float32), exposure, generator)
+        return self.expose(np.zeros(self.design.sensor_shape, np.float32), exposure, generator)
 
     def truth(
         self, scene: DataArray, *, distance: float = 300.0, depth: np.ndarray | None = None
@@ -224,7 +224,8 @@ class Camera:
         plane = np.full(values.shape[:2], distance) if depth is None else np.asarray(depth)
         return Truth(cube, far / plane[np.ix_(rows, columns)], self.design.centres)
 
-    def _expose(self, rate: np.ndarray, exposure: float, generator: Generator | None) -> Raw:
+    def expose(self, rate: np.ndarray, exposure: float, generator: Generator | None = None) -> Raw:
+        """Take a frame of the photoelectrons per ms, (rows, columns), that `rate` returned."""
         if not exposure > 0:
             raise InputError(f"The exposure must be a positive number of ms, not {exposure}.")
         frame = self.sensor.expose(rate, exposure, generator=generator)
@@ -244,7 +245,7 @@ class Camera:
         total = np.zeros(self.design.sensor_shape, np.float32)
         for unit, window in enumerate(self.windows):
             square, share = self._geometry[unit]
-            total[window] += share * np.interp(square, self.angles**2, rates[:, unit])
+            warp.add_flat(square, share, self.angles**2, rates[:, unit], total[window])
         return total
 
     def rate(
