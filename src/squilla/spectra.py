@@ -168,7 +168,7 @@ def gaussian_mixtures(
 
     success = torch.rand(count, generator=generator).clamp_min(1e-12)
     lines = (success.log() / np.log(0.7)).floor().long() + fewest
-    most = int(lines.max())
+    most = int(lines.max()) if count else 0
     low, high = round(float(wavelength[0])), round(float(wavelength[-1]))
     centre = torch.randint(low, high + 1, (count, most), generator=generator).float()
     height = torch.rand(count, most, generator=generator)
@@ -278,8 +278,9 @@ def _sum_of_lines(
     position = torch.as_tensor(np.asarray(wavelength), dtype=torch.float32)
     total = torch.zeros(len(centre), len(position))
     for line in range(centre.shape[1]):  # a loop, for the whole (N, lines, K) would not fit
-        offset = (position - centre[:, line, None]) / fwhm[:, line, None]
-        total += height[:, line, None] * torch.exp(-4 * np.log(2) * offset**2)
+        there = torch.nonzero(height[:, line])[:, 0]  # most spectra have few of the lines
+        offset = (position - centre[there, line, None]) / fwhm[there, line, None]
+        total[there] += height[there, line, None] * torch.exp(-4 * np.log(2) * offset**2)
     return total
 
 
