@@ -24,11 +24,17 @@ CAMERA = smooth_camera(0, filters=12, bands=48, angles=3)
 NETWORKS = [name for name in MODELS if model_class(name).trained]
 
 
-@pytest.fixture(scope="module", params=list(MODELS))
-def model(request):
+def untrained(name, camera=CAMERA):
+    if name == "twist":  # to the default tolerance it would take the time of all others together
+        return model_class(name)(camera, tolerance=0.1)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return model_class(request.param)(CAMERA).eval()
+        return model_class(name)(camera).eval()
+
+
+@pytest.fixture(scope="module", params=list(MODELS))
+def model(request):
+    return untrained(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +109,7 @@ def test_one_angle_serves_all_pixels(model, y):
 @torch.no_grad()
 def test_angles_do_nothing_without_a_sensitivity_that_knows_them(model, y, angle):
     flat = Calibration.from_sensitivity(CAMERA.sensitivity[0], CAMERA.wavelength)
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        plain = type(model)(flat).eval()
+    plain = untrained(model.name, flat)
     assert torch.equal(plain(y, angle), plain(y))
 
 
@@ -135,7 +139,7 @@ def test_solvers_explain_the_measurement(model, spectra):
     if model.trained:
         pytest.skip("untrained weights explain nothing")
     y = CAMERA.project(spectra)
-    rest = CAMERA.project(model.tuned(60)(y)) - y
+    rest = CAMERA.project(model.tuned(35)(y)) - y
     assert rest.norm() < 0.05 * y.norm()
 
 

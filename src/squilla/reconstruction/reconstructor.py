@@ -108,14 +108,15 @@ class Reconstructor(nn.Module):
         """
         y, angle = self._accepted(y, angle)
         pixels = y.shape[:-1]
+        if y.numel() == 0:
+            return y.new_zeros(*pixels, len(self.wavelength))
         y = y.reshape(-1, y.shape[-1])
         angles = None if angle is None else angle.reshape(-1).split(self.piece)
         parts = [
             self._piece(part, None if angles is None else angles[index], scale)
             for index, part in enumerate(y.split(self.piece))
         ]
-        spectra = torch.cat(parts) if parts else y.new_zeros(0, len(self.wavelength))
-        return spectra.reshape(*pixels, len(self.wavelength))
+        return torch.cat(parts).reshape(*pixels, len(self.wavelength))
 
     def _piece(self, y: Tensor, angle: Tensor | None, scale: Scale) -> Tensor:
         finite = y.isfinite().all(-1, keepdim=True)
