@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from random_camera import smooth_camera
 
+from random_camera import smooth_camera
 from squilla.reconstruction.networks import CNN, MLP, ResCNN, ReSpecNN, UNet
 from squilla.reconstruction.reconstructor import MODELS, model_class
 
