@@ -78,6 +78,8 @@ def calibrate(
     surface = zones.surface(lattice, zones(light.__getitem__), light.shape)
     relative = np.where(valid, light / np.maximum(surface, 1e-6), 1.0).astype(np.float32)
 
+    bias = np.where(lit, darks.bias, np.median(darks.bias)).astype(np.float32)
+    dark_rate = np.where(lit, darks.rate, 0).astype(np.float32)
     wavelength, bandwidth, response = sweep_responses(sweep, darks, relative, saturation, zones)
     sensitivity = np.maximum(unfold(wavelength, bandwidth, response, design.wavelength), 0)
     return Calibration(
@@ -85,10 +87,11 @@ def calibrate(
         sensitivity,
         zones.angle,
         lattice,
-        Pixels(darks.bias, darks.rate, relative, valid, saturation, gain, read_noise),
+        Pixels(bias, dark_rate, relative, valid, saturation, gain, read_noise),
         {
             "software": f"squilla {__version__}",
             "design": design.name,
+            "camera": flats.camera,
             "sweep_steps": len(wavelength),
             "target_distance": target_distance or 0.0,
             "target_score": score,

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -192,6 +193,12 @@ class Calibration:
         for node, sensitivity in enumerate(self.sensitivities):
             total += weights[..., node, None] * (cube @ sensitivity.T)
         return total
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration as one NetCDF file; see `squilla.calibration.store`."""
+        from squilla.calibration.store import save_calibration
+
+        save_calibration(self, path)
 
     def on(self, wavelength: np.ndarray) -> "Calibration":
         """Return the same calibration on another wavelength grid within its own."""

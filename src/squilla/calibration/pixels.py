@@ -18,11 +18,13 @@ class Stack:
     mean : (rows, columns) float32, DN.
     variance : (rows, columns) float32, DN^2, from frame to frame; None for one frame.
     exposure : ms, of the last frame; None if unknown.
+    camera : as the frames name it.
     """
 
     mean: np.ndarray
     variance: np.ndarray | None
     exposure: float | None
+    camera: str
 
     @classmethod
     def of(cls, raws: Iterable[Raw], kind: str) -> "Stack":
@@ -33,7 +35,7 @@ class Stack:
         InputError
             If there is no frame, or they differ in size.
         """
-        count, first, exposure = 0, None, None
+        count, first, exposure, camera = 0, None, None, ""
         total = squares = np.zeros((0, 0), np.float32)
         for raw in raws:
             if first is None:  # what is summed is the small difference to it: float32 is enough
@@ -45,11 +47,12 @@ class Stack:
                 )
             _accumulate(raw.frame, first, total, squares)
             count, exposure = count + 1, raw.exposure
+            camera = str(raw.metadata.get("camera", ""))
         if first is None:
             raise InputError(f"There is no {kind} frame; at least one is needed, better eight.")
         mean = total / count
         variance = (squares - count * mean**2) / (count - 1) if count > 1 else None
-        return cls(first + mean, variance, exposure)
+        return cls(first + mean, variance, exposure, camera)
 
 
 @numba.njit(parallel=True, cache=True)
