@@ -1,10 +1,13 @@
-"""Scenes to photograph: the colour chart under the light of the evaluation."""
+"""Scenes to photograph: the colour chart, two measured pictures, files of one's own."""
+
+from importlib.resources import files as package_files
+from pathlib import Path
 
 import numpy as np
 from xarray import DataArray
 
 from squilla.errors import InputError
-from squilla.files.cube import labelled
+from squilla.files.cube import labelled, read_scene
 from squilla.spectra import CHART_LIGHT, chart_reflectances, lights, resample
 
 CHART_SHAPE = (4, 6)
@@ -74,3 +77,75 @@ def chart_scene(light: str = CHART_LIGHT, size: int = 250) -> DataArray:
         chart.wavelength,
         attributes={"name": f"colour chart under {light}", "light": light},
     )
+
+
+_SHIPPED = {
+    "indian-pines": "indian_pines.npz",
+    "corn-kernel": "corn-kernel-hyperspectral.hdr",
+}
+SCENES = ("chart", *_SHIPPED)
+"""Names of the scenes that ship."""
+
+
+def load_scene(
+    source: str | Path, wavelength: np.ndarray, size: int = 250, *, light: str = CHART_LIGHT
+) -> DataArray:
+    """Return a scene that fills the camera's field, by name or from a file.
+
+    The shipped pictures are taken out of their own light, whose spectrum is estimated as the 99th
+    percentile of each band, and put under `light`. A file of one's own keeps its light.
+
+    Parameters
+    ----------
+    source : str or Path
+        "chart", "indian-pines", "corn-kernel", or a file that `read_scene` reads.
+    wavelength : array, (K,)
+        Wavelengths of the camera, nm, which the scene must cover.
+    size : int
+        Height and width wanted, px.
+    light : str
+        Name of a light in `squilla.spectra.lights`.
+
+    Returns
+    -------
+    DataArray, (y, x, wavelength), float32, about 1 at its brightest
+    """
+    if source == "chart":
+        chart = chart_scene(light, size)
+        values = resample(chart.values, chart["wavelength"].values, wavelength)
+        return labelled(values, wavelength, attributes=chart.attrs)
+    shipped = _SHIPPED.get(str(source))
+    if shipped is None:
+        scene = read_scene(source)
+        return fitted(scene, wavelength, size)
+    folder = Path(str(package_files("squilla"))) / "data" / "scenes"
+    picture = fitted(read_scene(folder / shipped), wavelength, size)
+    lamp = lights().on(wavelength)[lights().name.index(light)]
+    own = np.percentile(picture.values, 99, axis=(0, 1))
+    values = np.clip(picture.values / own, 0, 1.2) * lamp
+    return labelled(
+        values.astype(np.float32),
+        wavelength,
+        attributes={"name": f"{source} under {light}", "light": light},
+    )
+
+
+def fitted(scene: DataArray, wavelength: np.ndarray, size: int) -> DataArray:
+    """Cut the middle square out of a scene and resize it to the camera's field and wavelengths.
+
+    Bicubic, with smoothing where it becomes smaller; scaled to 1 at its 99.9th percentile.
+    """
+    import torch
+
+    values = resample(
+        scene.values.astype(np.float32), np.asarray(scene["wavelength"], float), wavelength
+    )
+    side = min(values.shape[:2])
+    top, left = ((length - side) // 2 for length in values.shape[:2])
+    square = torch.from_numpy(values[top : top + side, left : left + side]).permute(2, 0, 1)
+    resized = torch.nn.functional.interpolate(
+        square[None], (size, size), mode="bicubic", antialias=True, align_corners=False
+    )[0].clamp_min(0)
+    values = resized.permute(1, 2, 0).numpy()
+    peak = max(float(np.percentile(values, 99.9)), 1e-12)
+    return labelled(np.ascontiguousarray(values / peak), wavelength, attributes=dict(scene.attrs))
