@@ -136,6 +136,8 @@ def test_wrong_shapes_are_refused(model, y, angle):
         model(y, angle[:5])
     with pytest.raises(InputError, match="NaN"):
         model(y, torch.full((24,), torch.nan))
+    with pytest.raises(InputError, match="no scale"):
+        model(y, scale="thesis")
 
 
 @torch.no_grad()
@@ -348,6 +350,11 @@ def test_unknown_names_are_answered_with_the_known_ones(tmp_path):
 def test_solvers_have_nothing_to_save(tmp_path):
     with pytest.raises(InputError, match="no weights"):
         load_model("ridge", CAMERA).save(tmp_path / "ridge.safetensors")
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match="no folder"):
+        model_class("mlp")(CAMERA).save(tmp_path / "nowhere" / "model.safetensors")
 
 
 def test_an_interrupted_save_leaves_the_old_file(saved, monkeypatch):

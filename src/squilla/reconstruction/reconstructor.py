@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import tempfile
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.resources import files as package_files
@@ -104,8 +103,11 @@ class Reconstructor(nn.Module):
         Raises
         ------
         InputError
-            If `y` has another number of channels, or `angle` another shape than the pixels.
+            If `y` has another number of channels, `angle` another shape than the pixels, or
+            `scale` another name.
         """
+        if scale not in ("consistent", "maximum"):
+            raise InputError(f"There is no scale {scale!r}; there are 'consistent' and 'maximum'.")
         y, angle = self._accepted(y, angle)
         pixels = y.shape[:-1]
         if y.numel() == 0:
@@ -393,10 +395,11 @@ def _check_camera(
 
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that a reader sees the old content or the new, never a part."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as new:
-        new.write(content)
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"There is no folder {path.parent} for {path.name}; make it first.")
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        os.replace(new.name, path)
-    except OSError:
-        os.unlink(new.name)
-        raise
+        partial.write_bytes(content)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
