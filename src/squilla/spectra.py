@@ -113,6 +113,8 @@ def resample(spectrum: np.ndarray, wavelength: np.ndarray, onto: np.ndarray) -> 
         )
     if not np.all(np.diff(wavelength) > 0):
         raise InputError("Wavelengths must increase from band to band; sort the bands first.")
+    if np.array_equal(onto, wavelength):
+        return spectrum
     slack = 1e-6
     if onto.min() < wavelength[0] - slack or onto.max() > wavelength[-1] + slack:
         raise InputError(
@@ -168,7 +170,7 @@ def gaussian_mixtures(
 
     success = torch.rand(count, generator=generator).clamp_min(1e-12)
     lines = (success.log() / np.log(0.7)).floor().long() + fewest
-    most = int(lines.max())
+    most = int(lines.max()) if count else 0
     low, high = round(float(wavelength[0])), round(float(wavelength[-1]))
     centre = torch.randint(low, high + 1, (count, most), generator=generator).float()
     height = torch.rand(count, most, generator=generator)
@@ -278,12 +280,46 @@ def _sum_of_lines(
     position = torch.as_tensor(np.asarray(wavelength), dtype=torch.float32)
     total = torch.zeros(len(centre), len(position))
     for line in range(centre.shape[1]):  # a loop, for the whole (N, lines, K) would not fit
-        offset = (position - centre[:, line, None]) / fwhm[:, line, None]
-        total += height[:, line, None] * torch.exp(-4 * np.log(2) * offset**2)
+        there = torch.nonzero(height[:, line])[:, 0]  # most spectra have few of the lines
+        offset = (position - centre[there, line, None]) / fwhm[there, line, None]
+        total[there] += height[there, line, None] * torch.exp(-4 * np.log(2) * offset**2)
     return total
 
 
 # --- colour ---------------------------------------------------------------------------------
+
+
+def tristimulus(spectrum: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
+    """Return what the three receptors of the CIE 1931 observer see, XYZ, in a scale of their own.
+
+    Wavelengths outside the band add nothing.
+
+    Parameters
+    ----------
+    spectrum : array, (..., K)
+        Photon radiance, any scale.
+    wavelength : array, (K,)
+        nm, increasing.
+
+    Returns
+    -------
+    array, (..., 3)
+
+    Source: CIE 015:2018 through colour-science.
+    """
+    import colour
+
+    wavelength = np.asarray(wavelength, float)
+    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    matching = np.stack(
+        [
+            np.interp(wavelength, observer.wavelengths, receptor, left=0, right=0)
+            for receptor in observer.values.T
+        ],
+        axis=-1,
+    )
+    step = np.gradient(wavelength) if len(wavelength) > 1 else np.ones(1)
+    return np.asarray(spectrum) @ (matching * (step / wavelength)[:, None])  # photons to power
 
 
 def rgb(
@@ -317,16 +353,9 @@ def rgb(
     """
     import colour
 
-    wavelength = np.asarray(wavelength, float)
-    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    matching = np.stack(
-        [np.interp(wavelength, observer.wavelengths, channel) for channel in observer.values.T], -1
-    )
-    step = np.gradient(wavelength) if len(wavelength) > 1 else np.ones(1)
-    matching = matching * (step / wavelength)[:, None]  # photons to power
     white = np.ones(len(wavelength)) if white is None else np.asarray(white, float)
-    white_xyz = white @ matching
-    xyz = np.nan_to_num(np.asarray(cube)) @ matching / white_xyz[1]
+    white_xyz = tristimulus(white, wavelength)
+    xyz = tristimulus(np.nan_to_num(np.asarray(cube)), wavelength) / white_xyz[1]
     if exposure is None:
         exposure = float(np.percentile(xyz[..., 1], 99))
     xyz = xyz / max(exposure, 1e-12)

@@ -1,0 +1,412 @@
+"""The digital twin: what the designed camera would record of a scene."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Generator, Tensor
+from xarray import DataArray
+
+from squilla.camera import lens, warp
+from squilla.camera.design import CameraDesign
+from squilla.camera.sensor import ImageSensor
+from squilla.errors import InputError
+from squilla.files.raw import Raw
+from squilla.optics.filters import StencilRecipe, read_filters
+from squilla.spectra import resample
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the twin knows and no reconstruction may: for judging only.
+
+    cube : DataArray (y, x, wavelength), the scene as the reference unit sees it, unblurred.
+    disparity : (H, W) px per lens pitch.
+    centres : (M, 2) px, where each unit images an infinitely distant point on the axis.
+    """
+
+    cube: DataArray
+    disparity: np.ndarray
+    centres: np.ndarray
+
+
+_MARGIN = 16
+"""Pixels around a window that the blur may bring in."""
+
+
+class Camera:
+    """A camera that exists only as numbers.
+
+    Parameters
+    ----------
+    design : CameraDesign, str or Path
+        A design, its TOML file, or "thesis".
+
+    Notes
+    -----
+    A scene is a DataArray (y, x, wavelength) of relative photon radiance; a value of 1 is
+    ``design.light.radiance``. One sample falls on one sensor pixel, the middle of the scene on the
+    axis of the reference unit, in the orientation of the sub-images. Beyond its edge a scene goes
+    on as its mirror image.
+
+    Filters and blur at a field angle are interpolated between a few angles, linearly in the squared
+    angle; the blur over wavelength and angle is a sum of a few separable terms. So one unit's
+    sub-image is, with the frequency response v_r and the shift s,
+
+        image(q) = V(q) F^-1[ exp(-2 pi i f s) sum_r v_r(f) F[ sum_a w_a(q) sum_k B_ark X_k ] ](q).
+    """
+
+    def __init__(self, design: CameraDesign | str | Path = "thesis"):
+        self.design = design if isinstance(design, CameraDesign) else CameraDesign.load(design)
+        self.sensor = ImageSensor(self.design)
+        self.windows = [lens.lit(self.design, unit) for unit in range(self.design.units)]
+
+    @cached_property
+    def filters(self):
+        """The filters, with a method ``transmittance(wavelength, angle)``."""
+        filters = self.design.filters
+        if filters.recipe is not None:
+            count = self.design.units
+            return StencilRecipe(filters=count).draw(filters.seed)
+        measured = read_filters(filters.table, effective_index=filters.effective_index)
+        if len(measured.values) != self.design.units:
+            raise InputError(
+                f"The filter table {filters.table} has {len(measured.values)} filters; the array "
+                f"has {self.design.units} units."
+            )
+        return measured
+
+    @cached_property
+    def angles(self) -> np.ndarray:
+        """Field angles between which filters and blur are interpolated, (A,) rad.
+
+        Evenly in the squared angle: four up to the field's corner, two beyond, to the last lit one.
+        """
+        size = np.array([self.design.field.size / np.sqrt(2), self._farthest])
+        corner, last = np.arctan(size / self.design.focal) ** 2
+        return np.sqrt([*np.linspace(0, corner, 4), (corner + last) / 2, last])
+
+    @property
+    def _farthest(self) -> float:
+        """Largest distance of a lit pixel from its lens' axis, px."""
+        reach = [
+            [
+                max(centre - part.start, part.stop - centre)
+                for part, centre in zip(w, c, strict=True)
+            ]
+            for w, c in zip(self.windows, self.design.centres, strict=True)
+        ]
+        return float(np.hypot(*np.array(reach).T).max())
+
+    def response(self, angle: ArrayLike) -> np.ndarray:
+        """Return the photoelectrons per ms of a scene of value 1 in each band, before vignetting.
+
+        Parameters
+        ----------
+        angle : array, (A,)
+            Field angle, rad.
+
+        Returns
+        -------
+        array, (A, M, K), e-/ms
+
+        Source: radiance x solid angle of the pupil x pixel area x band x T Q; T averaged over the
+        cone of light that reaches the pixel.
+        """
+        design, angle = self.design, np.atleast_1d(np.asarray(angle, float))
+        cones = [lens.cone(design, float(one)) for one in angle]
+        widest = max(angles.max() for angles, _ in cones)
+        square = np.linspace(0, widest**2, 48 if widest > 0 else 1)  # T is smooth in the square
+        table = self.filters.transmittance(design.wavelength, np.sqrt(square)).numpy()
+        flat = table.reshape(len(square), -1)
+        mean = np.stack(
+            [
+                weights @ resample(flat.T, square, angles**2).T if len(square) > 1 else flat[0]
+                for angles, weights in cones
+            ]
+        ).reshape(len(angle), *table.shape[1:])
+        solid = np.pi * (design.lens.diameter / 2) ** 2 / design.lens.focal_length**2
+        pixel = (design.sensor.pixel * 1e-6) ** 2
+        scale = design.light.radiance * solid * pixel / 1000 * design.band.step
+        return scale * mean * design.quantum_efficiency
+
+    def sensitivity(self, angle: ArrayLike) -> np.ndarray:
+        """Return the true sensitivity, (A, M, K) DN/ms; for judging a calibration only."""
+        angle = np.atleast_1d(np.asarray(angle, float))
+        falloff = np.cos(angle) ** 4 if self.design.effects.vignetting else np.ones(len(angle))
+        return self.response(angle) * falloff[:, None, None] / self.design.sensor.gain
+
+    @cached_property
+    def _node_response(self) -> np.ndarray:
+        return self.response(self.angles)
+
+    @cached_property
+    def serial(self) -> str:
+        """Name and short digest of the design: what a real camera's serial number would be."""
+        digest = hashlib.sha256(self.design.model_dump_json(exclude={"effects"}).encode())
+        return f"{self.design.name}-{digest.hexdigest()[:8]}"
+
+    # --- taking pictures ----------------------------------------------------------------------
+
+    def capture(
+        self,
+        scene: DataArray,
+        *,
+        distance: float = 300.0,
+        depth: np.ndarray | None = None,
+        exposure: float | None = None,
+        snr: float | None = None,
+        generator: Generator | None = None,
+    ) -> Raw:
+        """Take a raw frame of a scene.
+
+        Parameters
+        ----------
+        scene : DataArray, (y, x, wavelength)
+            Relative photon radiance; its wavelengths must cover the camera's band.
+        distance : float
+            Distance of a plane scene facing the camera, mm.
+        depth : array, (y, x), optional
+            Distance of every scene sample, mm, in the reference unit's view; nearer surfaces hide
+            farther ones in the other units' views. Overrides `distance`.
+        exposure : float, optional
+            ms.
+        snr : float, optional
+            Signal-to-noise ratio over all sub-images, dB, instead of an exposure.
+        generator : torch.Generator, optional
+            Seeds the noise.
+
+        Returns
+        -------
+        Raw
+
+        Raises
+        ------
+        InputError
+            If the scene has NaN or negative values or does not cover the band, or if neither or
+            both of `exposure` and `snr` are given, or the SNR cannot be reached.
+        """
+        if (exposure is None) == (snr is None):
+            raise InputError("Give either an exposure in ms or an SNR in dB.")
+        rate = self.rate(scene, distance=distance, depth=depth)
+        if snr is not None:
+            exposure = self.sensor.exposure_for(self._fields(rate), snr)
+        return self.expose(rate, exposure, generator)
+
+    def capture_flat(
+        self, light: np.ndarray, exposure: float, *, generator: Generator | None = None
+    ) -> Raw:
+        """Take a frame of an evenly lit surface that fills every view, spectrum `light` (K,)."""
+        return self.expose(self.flat_rate(light), exposure, generator)
+
+    def capture_dark(self, exposure: float, *, generator: Generator | None = None) -> Raw:
+        """Take a frame with the lens covered."""
+        return self.expose(np.zeros(self.design.sensor_shape, np.float32), exposure, generator)
+
+    def truth(
+        self, scene: DataArray, *, distance: float = 300.0, depth: np.ndarray | None = None
+    ) -> Truth:
+        """Return what a perfect reconstruction of a capture would be; for judging only."""
+        values = self._values(scene)
+        size = self.design.field.size
+        rows, columns = (_middle(size, length) for length in values.shape[:2])
+        cube = DataArray(
+            values[np.ix_(rows, columns)],
+            dims=("y", "x", "wavelength"),
+            coords={"wavelength": ("wavelength", self.design.wavelength, {"units": "nm"})},
+            attrs=scene.attrs,
+        )
+        far = self.design.array.pitch / 1000 * self.design.focal
+        plane = np.full(values.shape[:2], distance) if depth is None else np.asarray(depth)
+        return Truth(cube, far / plane[np.ix_(rows, columns)], self.design.centres)
+
+    def expose(self, rate: np.ndarray, exposure: float, generator: Generator | None = None) -> Raw:
+        """Take a frame of the photoelectrons per ms, (rows, columns), that `rate` returned."""
+        if not exposure > 0:
+            raise InputError(f"The exposure must be a positive number of ms, not {exposure}.")
+        frame = self.sensor.expose(rate, exposure, generator=generator)
+        return Raw(frame, exposure, {"camera": self.serial, "bits": self.design.sensor.bits})
+
+    def _fields(self, image: np.ndarray) -> np.ndarray:
+        """Return the pixels within the units' fields, (M, size, size)."""
+        size = self.design.field.size
+        corner = np.rint(self.design.centres - (size - 1) / 2).astype(int)
+        return np.stack([image[y : y + size, x : x + size] for y, x in corner])
+
+    # --- light on the sensor ------------------------------------------------------------------
+
+    def flat_rate(self, light: np.ndarray) -> np.ndarray:
+        """Return the photoelectrons per ms of an evenly lit surface, (rows, columns) float32."""
+        rates = self._node_response @ np.asarray(light, float)
+        total = np.zeros(self.design.sensor_shape, np.float32)
+        for unit, window in enumerate(self.windows):
+            square, share = self._geometry[unit]
+            warp.add_flat(square, share, self.angles**2, rates[:, unit], total[window])
+        return total
+
+    def rate(
+        self, scene: DataArray, *, distance: float = 300.0, depth: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the photoelectrons per ms of a scene, (rows, columns) float32, without noise."""
+        values = torch.from_numpy(self._values(scene))
+        plane = self._disparity(distance, depth, values.shape[:2])
+        blur = self._blur(float(np.median(depth)) if depth is not None else distance)
+        reference = self.design.centres[self.design.field.reference]
+        baselines = (self.design.centres - reference) / self.design.pitch
+        margin = _MARGIN + int(
+            np.ceil(np.abs(plane - np.mean(plane)).max() * np.abs(baselines).max())
+        )
+        tallest = np.max(
+            [[part.stop - part.start for part in window] for window in self.windows], 0
+        )
+        size = tuple(_fast_length(int(length)) for length in tallest + 2 * margin + 2)
+        transfer = blur.on_grid(size)
+        response = torch.from_numpy(self._node_response).float()
+        pixels = values.reshape(-1, values.shape[-1])
+        total = np.zeros(self.design.sensor_shape, np.float32)
+        for unit, window in enumerate(self.windows):
+            # What the unit sees of every sample, for each angle and term of the blur: (y, x, A, r).
+            filtered = (response[:, unit, None, :] * blur.weight).flatten(0, 1)
+            seen = (pixels @ filtered.T).view(*values.shape[:2], *blur.weight.shape[:2]).numpy()
+            image = self._project(seen, unit, baselines[unit], plane, margin, transfer, size)
+            total[window] += self._geometry[unit][1] * np.maximum(image, 0)
+        return total
+
+    def _project(
+        self,
+        seen: np.ndarray,
+        unit: int,
+        baseline: np.ndarray,
+        plane: float | np.ndarray,
+        margin: int,
+        transfer: Tensor,
+        size: tuple[int, int],
+    ) -> np.ndarray:
+        """Blur what a unit sees of every scene sample, (y, x, A, r), and lay it on its window."""
+        start = np.array([part.start for part in self.windows[unit]])
+        stop = np.array([part.stop for part in self.windows[unit]])
+        rows, columns = stop - start
+        middle = float(np.mean(plane))
+        on_axis = start - self.design.centres[unit]
+        # Scene position of the window's first pixel, and of the first pixel of the canvas around.
+        origin = on_axis - middle * baseline + (np.array(seen.shape[:2]) - 1) / 2
+        first = np.floor(origin).astype(int) - margin
+        position = on_axis + first - origin
+        canvas = warp.weigh(seen, first, position, self.design.focal, self.angles**2, size)
+        if isinstance(plane, float):
+            transfer = transfer * _shift(origin - first, size)
+        spectrum = (torch.fft.rfft2(torch.from_numpy(canvas)) * transfer).sum(0)
+        image = torch.fft.irfft2(spectrum, s=size).numpy()
+        if isinstance(plane, float):
+            return image[:rows, :columns]
+        return warp.relief(image, plane, first, origin, middle, baseline, (rows, columns))
+
+    def _blur(self, distance: float) -> "Blur":
+        inner = np.minimum(
+            self.angles, self.angles[3]
+        )  # outside the field it stays as in its corner
+        cycles = np.linspace(0, np.sqrt(0.5), 96)
+        return Blur.of(lens.transfer_function(self.design, inner, distance, cycles), cycles)
+
+    @cached_property
+    def _geometry(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Squared field angle and share of light over each unit's window, (H, W) float32."""
+        geometry = []
+        for unit, window in enumerate(self.windows):
+            rows, columns = (
+                np.arange(part.start, part.stop) - centre
+                for part, centre in zip(window, self.design.centres[unit], strict=True)
+            )
+            tangent = np.hypot(rows[:, None], columns[None, :]) / self.design.focal
+            share = lens.vignetting(self.design, unit, rows, columns)
+            geometry.append(
+                ((np.arctan(tangent) ** 2).astype(np.float32), share.astype(np.float32))
+            )
+        return geometry
+
+    def _disparity(self, distance: float, depth: np.ndarray | None, shape):
+        far = self.design.array.pitch / 1000 * self.design.focal
+        nearest = self.design.lens.focal_length / 1000 * 5
+        if depth is None:
+            if not distance > nearest:
+                raise InputError(f"The distance must be above {nearest:g} mm, not {distance:g} mm.")
+            return far / distance
+        depth = np.asarray(depth, float)
+        if depth.shape != tuple(shape):
+            raise InputError(
+                f"The depth map has shape {depth.shape}, the scene {tuple(shape)}; make them agree."
+            )
+        if not np.all(np.isfinite(depth)) or depth.min() <= nearest:
+            raise InputError(f"Every depth must be finite and above {nearest:g} mm.")
+        return far / depth
+
+    def _values(self, scene: DataArray) -> np.ndarray:
+        """Return a scene on the camera's wavelengths, (y, x, K) float32; checks it first."""
+        if set(scene.dims) != {"y", "x", "wavelength"} or "wavelength" not in scene.coords:
+            raise InputError(
+                "A scene is a DataArray with dimensions (y, x, wavelength) and a wavelength "
+                f"coordinate in nm; this one has {tuple(scene.dims)}."
+            )
+        scene = scene.transpose("y", "x", "wavelength")
+        values = np.ascontiguousarray(
+            resample(scene.values, scene.wavelength.values, self.design.wavelength), np.float32
+        )
+        if not np.isfinite(values).all():
+            raise InputError("The scene holds NaN or infinite values; fill them before capturing.")
+        if values.min() < 0:
+            raise InputError("The scene holds negative radiance; clip it at zero before capturing.")
+        return values
+
+
+@dataclass(frozen=True)
+class Blur:
+    """The blur over angle and wavelength as a sum of a few terms weight(a, k) frequency(f).
+
+    weight : Tensor, (A, r, K).  frequency : (r, F) over `cycles` (F,), cycles per px.
+    """
+
+    weight: Tensor
+    frequency: np.ndarray
+    cycles: np.ndarray
+
+    @classmethod
+    def of(cls, transfer: np.ndarray, cycles: np.ndarray, tolerance: float = 5e-3) -> "Blur":
+        """Separate a transfer function (A, K, F) to a relative tolerance by its SVD."""
+        angles, bands, _ = transfer.shape
+        left, values, right = np.linalg.svd(transfer.reshape(angles * bands, -1), False)
+        lost = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1] / np.sum(values**2))
+        rank = max(1, int(np.sum(lost > tolerance)))
+        weight = (left[:, :rank] * values[:rank]).reshape(angles, bands, rank)
+        weight = torch.from_numpy(weight).float().permute(0, 2, 1).contiguous()
+        return cls(weight, right[:rank], cycles)
+
+    def on_grid(self, size: tuple[int, int]) -> Tensor:
+        """Return each term on the grid of a real FFT, times the pixel's aperture, (r, ...)."""
+        y, x = np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1])[None, :]
+        radius, pixel = np.hypot(y, x), np.sinc(y) * np.sinc(x)
+        terms = np.stack([np.interp(radius, self.cycles, term) for term in self.frequency])
+        return torch.from_numpy(terms * pixel).float()
+
+
+def _shift(offset: np.ndarray, size: tuple[int, int]) -> Tensor:
+    """Return the phase that moves a picture so that position `offset` becomes its first pixel."""
+    y, x = np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1])[None, :]
+    return torch.from_numpy(np.exp(2j * np.pi * (y * offset[0] + x * offset[1]))).to(
+        torch.complex64
+    )
+
+
+def _middle(size: int, length: int) -> np.ndarray:
+    """Return the indices of the middle `size` samples of an axis that goes on mirrored."""
+    index = np.rint((length - size) / 2 + np.arange(size)).astype(int) % (2 * length)
+    return np.where(index < length, index, 2 * length - 1 - index)
+
+
+def _fast_length(length: int) -> int:
+    from scipy.fft import next_fast_len
+
+    return next_fast_len(length, real=True)

@@ -1,0 +1,371 @@
+"""Cubes on disk: NetCDF, ENVI, TIFF, Zarr by suffix, and scenes as others store them."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from xarray import DataArray
+
+from squilla.errors import InputError
+from squilla.files.arrays import assemble, read_mat, read_npy, read_npz
+from squilla.files.disk import check_size, existing, reading, replacing
+from squilla.files.envi import DATA_SUFFIXES, read_envi, write_envi
+
+CUBE_SUFFIXES = (".nc", ".hdr", ".tiff", ".tif", ".zarr")
+"""What `save` writes and `load_cube` reads."""
+
+SCENE_SUFFIXES = (*CUBE_SUFFIXES, *DATA_SUFFIXES, ".npz", ".npy", ".mat")
+"""What `read_scene` reads."""
+
+_DIMS = ("y", "x", "wavelength")
+
+
+def labelled(
+    values: np.ndarray,
+    wavelength: np.ndarray,
+    *,
+    name: str = "radiance",
+    attributes: Mapping[str, Any] | None = None,
+) -> DataArray:
+    """Make a cube of numbers and their wavelengths.
+
+    Parameters
+    ----------
+    values : array, (H, W, K)
+    wavelength : array, (K,)
+        nm.
+    name : str
+        What the values are.
+    attributes : mapping, optional
+
+    Returns
+    -------
+    DataArray, (y, x, wavelength), with the CF attributes of a wavelength in nm
+    """
+    about = {"standard_name": "radiation_wavelength", "long_name": "wavelength", "units": "nm"}
+    coordinate = ("wavelength", np.asarray(wavelength, float), about)
+    return DataArray(values, {"wavelength": coordinate}, _DIMS, name, dict(attributes or {}))
+
+
+def save(
+    cube: DataArray, path: str | Path, *, extra: Mapping[str, DataArray] | None = None
+) -> None:
+    """Write a cube as its suffix says: NetCDF .nc, ENVI .hdr, TIFF .tiff, Zarr .zarr.
+
+    The file is whole or not there at all. Attributes that are no plain number, string or list are
+    kept as JSON text.
+
+    Parameters
+    ----------
+    cube : DataArray, (y, x, wavelength)
+        With its wavelengths, nm, increasing; optionally a coordinate "fwhm" along them, nm.
+    path : str or Path
+    extra : mapping of name to DataArray, optional
+        What belongs to the cube, such as its uncertainty; further variables of a NetCDF or Zarr,
+        files beside it, ``doll-uncertainty.hdr``, for ENVI and TIFF.
+
+    Raises
+    ------
+    InputError
+        If the suffix is unknown, the cube has no usable wavelengths, or the place cannot be
+        written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in CUBE_SUFFIXES:
+        raise InputError(f"{path} must end in one of {', '.join(CUBE_SUFFIXES)} to be written.")
+    arrays = {str(cube.name or "cube"): _checked(cube)} | dict(extra or {})
+    arrays = {name: _plain(array.rename(name)) for name, array in arrays.items()}
+    if suffix in (".nc", ".zarr"):
+        dataset = xr.Dataset(arrays)
+        dataset.attrs = {"Conventions": "CF-1.11", "cube": next(iter(arrays))}
+        (_write_netcdf if suffix == ".nc" else _write_zarr)(dataset, path)
+        return
+    first, *others = arrays
+    for name in others:
+        _write_single(arrays[name], path.with_stem(f"{path.stem}-{name}"))
+    _write_single(arrays[first], path)
+
+
+def load_cube(path: str | Path) -> DataArray:
+    """Read a cube that `save` wrote, with its wavelengths and attributes.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    DataArray, (y, x, wavelength), in memory
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, of another kind, or holds no cube with wavelengths.
+    """
+    path = existing(path)
+    if path.suffix.lower() not in CUBE_SUFFIXES:
+        raise InputError(f"{path} must end in one of {', '.join(CUBE_SUFFIXES)} to be a cube.")
+    return _in_nanometres(_read(path, None, None), path)
+
+
+def read_scene(
+    path: str | Path,
+    *,
+    wavelength: np.ndarray | str | Path | None = None,
+    variable: str | None = None,
+) -> DataArray:
+    """Read a scene as others store it: ENVI, NetCDF, NPZ, NPY, MATLAB, or one of our own cubes.
+
+    Parameters
+    ----------
+    path : str or Path
+        An ENVI header or its data, .nc, .npz, .npy, .mat (version 5 or 7.3), .tiff, .zarr.
+    wavelength : array, (K,), or path, optional
+        Wavelengths, nm or um, where the file has none; a path leads to a text file with one
+        number a line, or to a .npy.
+    variable : str, optional
+        Name of the cube where a file holds several.
+
+    Returns
+    -------
+    DataArray, (y, x, wavelength), float32
+        Wavelengths in nm, increasing.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or foreign; if there are no wavelengths, or one occurs
+        twice; if values are NaN or infinite, or none is above zero.
+    """
+    path = existing(path)
+    if path.suffix.lower() not in SCENE_SUFFIXES:
+        raise InputError(f"{path} is none of the scenes known: {', '.join(SCENE_SUFFIXES)}.")
+    if isinstance(wavelength, str | Path):
+        wavelength = _read_vector(existing(wavelength))
+    given = None if wavelength is None else np.asarray(wavelength, float).ravel()
+    scene = _in_nanometres(_read(path, variable, given), path)
+    with np.errstate(over="ignore"):
+        values = np.ascontiguousarray(scene.values, np.float32)
+    if not np.isfinite(values).all():
+        raise InputError(f"{path} holds NaN or empty pixels; crop them away or fill them.")
+    if values.max(initial=0) <= 0:
+        raise InputError(f"{path} holds no value above zero; a scene is a radiance.")
+    return scene.copy(data=values)
+
+
+# --- wavelengths, attributes ----------------------------------------------------------------
+
+
+def _checked(cube: DataArray) -> DataArray:
+    """Return the cube as (y, x, wavelength) if it is one that can be written."""
+    if set(cube.dims) != set(_DIMS) or cube.size == 0:
+        raise InputError(f"A cube has the dims {_DIMS}; this one has {dict(cube.sizes)}.")
+    if "wavelength" not in cube.coords:
+        raise InputError('The cube has no coordinate "wavelength"; assign its wavelengths in nm.')
+    if cube.dtype.kind not in "iuf":
+        raise InputError(f"A cube holds real numbers; this one holds {cube.dtype}.")
+    cube = cube.transpose(*_DIMS)
+    about = {"standard_name": "radiation_wavelength", "long_name": "wavelength", "units": "nm"}
+    cube = cube.assign_coords(wavelength=cube["wavelength"].assign_attrs(about))
+    if not (np.diff(cube["wavelength"]) > 0).all():
+        raise InputError("The wavelengths of a cube must increase from band to band.")
+    return cube
+
+
+def _plain(array: DataArray) -> DataArray:
+    """Return the array with attributes that every format can hold."""
+
+    def plain(value):
+        if isinstance(value, np.ndarray | np.generic):
+            value = value.tolist()
+        if isinstance(value, bool):
+            return int(value)
+        numbers = isinstance(value, list | tuple) and all(
+            isinstance(each, int | float) and not isinstance(each, bool) for each in value
+        )
+        if isinstance(value, str | int | float) or (numbers and value):
+            return list(value) if isinstance(value, tuple) else value
+        return json.dumps(value, default=str)
+
+    return array.assign_attrs({key: plain(value) for key, value in array.attrs.items()})
+
+
+def _in_nanometres(cube: DataArray, path: Path) -> DataArray:
+    """Return the cube with its wavelengths in nm, increasing; refuse it if they cannot be had."""
+    if "wavelength" not in cube.coords:
+        raise InputError(
+            f"{path} tells no wavelengths; give them with wavelength=, one for each band, in nm."
+        )
+    stated = cube["wavelength"]
+    factor = _unit(str(stated.attrs.get("units", "")), stated.values, path)
+    wavelength = stated.values.astype(float) * factor
+    if not (np.isfinite(wavelength).all() and 100 <= wavelength.min() <= wavelength.max() <= 5e4):
+        raise InputError(
+            f"{path}: wavelengths from {wavelength.min():g} to {wavelength.max():g} nm make no "
+            "sense; give the right ones with wavelength=, in nm."
+        )
+    result = labelled(cube.values, wavelength, name=str(cube.name), attributes=cube.attrs)
+    for name, coordinate in cube.drop_vars("wavelength").coords.items():
+        scale = factor if name == "fwhm" else 1
+        result = result.assign_coords({name: (coordinate.dims, coordinate.values * scale)})
+    order = np.argsort(wavelength, kind="stable")
+    twice = wavelength[order][:-1][np.diff(wavelength[order]) == 0]
+    if len(twice):
+        raise InputError(f"{path} has two bands at {twice[0]:g} nm; keep one of them.")
+    return result if (np.diff(order) == 1).all() else result.isel(wavelength=order)
+
+
+def _unit(units: str, values: np.ndarray, path: Path) -> float:
+    """Return what turns these wavelengths into nm; where no unit is stated their size tells."""
+    units = units.strip().lower()
+    if re.fullmatch(r"nm|nanomet(er|re)s?", units):
+        return 1.0
+    if re.fullmatch(r"[uµμ]m|micromet(er|re)s?|microns?", units):
+        return 1e3
+    if re.fullmatch(r"m|met(er|re)s?", units):
+        return 1e9
+    if units in ("", "unknown"):
+        return 1e3 if values.max(initial=0) < 20 else 1.0
+    raise InputError(f"{path} states its wavelengths in {units!r}; nm or um was expected.")
+
+
+def _read_vector(path: Path) -> np.ndarray:
+    with reading(path, "list of wavelengths"):
+        if path.suffix.lower() == ".npy":
+            return np.load(path, allow_pickle=False)
+        return np.array(path.read_text().replace(",", " ").split(), float)
+
+
+# --- one reader and one writer for each kind --------------------------------------------------
+
+
+def _read(path: Path, variable: str | None, wavelength: np.ndarray | None) -> DataArray:
+    suffix = path.suffix.lower()
+    if suffix == ".nc":
+        return _read_dataset(path, variable, wavelength, kind="NetCDF")
+    if suffix == ".zarr":
+        _need_zarr(path)
+        return _read_dataset(
+            path, variable, wavelength, kind="Zarr", engine="zarr", consolidated=False
+        )
+    if suffix in (".npz", ".npy", ".mat"):
+        reader = {".npz": read_npz, ".npy": read_npy, ".mat": read_mat}[suffix]
+        return assemble(reader(path), path, variable, wavelength)
+    cube = _read_tiff(path) if suffix in (".tif", ".tiff") else read_envi(path)
+    if wavelength is None:
+        return cube
+    if len(wavelength) != cube.sizes["wavelength"]:
+        raise InputError(
+            f"{path} has {cube.sizes['wavelength']} bands, but {len(wavelength)} wavelengths are "
+            "given."
+        )
+    return cube.assign_coords(wavelength=wavelength)
+
+
+def _read_dataset(
+    path: Path, variable: str | None, wavelength: np.ndarray | None, *, kind: str, **how: Any
+) -> DataArray:
+    import h5py
+
+    with reading(path, kind):
+        if path.is_file() and h5py.is_hdf5(path):
+            h5py.File(path, "r").close()  # says in plain words what is wrong with a damaged file
+        dataset = xr.open_dataset(path, decode_times=False, **how)
+    with reading(path, kind), dataset:
+        arrays = {str(name): dataset[name] for name in dataset.variables}
+        arrays = {name: each for name, each in arrays.items() if each.dtype.kind in "iuf"}
+        check_size(path, sum(each.nbytes for each in arrays.values()))
+        variable = variable or dataset.attrs.get("cube")
+        cube = assemble(arrays, path, variable, wavelength)
+        cube.attrs = dict(dataset[cube.name].attrs)
+        for name, coordinate in dataset[cube.name].coords.items():
+            if name != "wavelength" and set(coordinate.dims) <= set(_DIMS):
+                cube = cube.assign_coords({name: coordinate.load()})
+        return cube
+
+
+def _write_netcdf(dataset: xr.Dataset, path: Path) -> None:
+    with replacing(path) as temporary:
+        dataset.to_netcdf(temporary, engine="h5netcdf")
+
+
+def _need_zarr(path: Path) -> None:
+    try:
+        import zarr  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            f"{path} needs the package zarr; install it with: pip install 'squilla[batch]'."
+        ) from error
+
+
+def _write_zarr(dataset: xr.Dataset, path: Path) -> None:
+    _need_zarr(path)
+    from zarr.codecs import BloscCodec
+
+    if path.is_dir() and any(path.iterdir()) and not (path / "zarr.json").exists():
+        raise InputError(f"{path} is a folder of other things; it is not replaced.")
+    packed = BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle")
+    encoding = {
+        name: {
+            "compressors": (packed,),
+            # Tiles with their whole spectra: a point is read without the rest of the picture.
+            "chunks": tuple(
+                min(size, 128) if dim in ("y", "x") else size for dim, size in array.sizes.items()
+            ),
+        }
+        for name, array in dataset.data_vars.items()
+    }
+    with replacing(path, folder=True) as temporary:
+        dataset.to_zarr(temporary, zarr_format=3, consolidated=False, encoding=encoding)
+
+
+def _write_single(array: DataArray, path: Path) -> None:
+    if array.dims[:2] != _DIMS[:2] or array.ndim > 3:
+        raise InputError(f"{path} cannot hold {array.name} of {array.dims}; use .nc or .zarr.")
+    if array.dtype == bool:
+        array = array.astype(np.uint8)
+    (write_envi if path.suffix.lower() == ".hdr" else _write_tiff)(array, path)
+
+
+def _write_tiff(array: DataArray, path: Path) -> None:
+    import tifffile
+
+    bands = array.values.reshape(*array.shape[:2], -1).transpose(2, 0, 1)
+    told: dict[str, Any] = {"name": array.name, "attributes": array.attrs}
+    for key in ("wavelength", "fwhm"):
+        if key in array.coords:
+            told[key] = array[key].values.tolist()
+    with replacing(path) as temporary:
+        tifffile.imwrite(
+            temporary,
+            np.ascontiguousarray(bands),
+            photometric="minisblack",
+            description=json.dumps(told),
+            metadata=None,
+        )
+
+
+def _read_tiff(path: Path) -> DataArray:
+    import tifffile
+
+    with reading(path, "TIFF"), tifffile.TiffFile(path) as tiff:
+        first = tiff.pages.first
+        check_size(path, len(tiff.pages) * first.nbytes)
+        bands = np.stack([page.asarray() for page in tiff.pages])
+        try:
+            told = json.loads(first.description)
+        except ValueError:
+            told = {}
+    if bands.ndim != 3:
+        raise InputError(f"{path} must hold one grey page for each band.")
+    coords = {}
+    for key in ("wavelength", "fwhm"):
+        if len(told.get(key, ())) == len(bands):
+            coords[key] = ("wavelength", np.array(told[key], float))
+    values = np.ascontiguousarray(bands.transpose(1, 2, 0))
+    return DataArray(values, coords, _DIMS, told.get("name", path.stem), told.get("attributes", {}))

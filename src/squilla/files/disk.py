@@ -1,0 +1,96 @@
+"""What is written is whole or not there; what is read is believed only as far as it can be true."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from uuid import uuid4
+
+from squilla.errors import InputError
+
+_DENSEST = 2000
+"""Bytes in memory that one byte on disk can stand for; deflate reaches 1030, on zeros alone."""
+
+
+@contextmanager
+def replacing(path: str | Path, *, folder: bool = False) -> Iterator[Path]:
+    """Lend a temporary name beside `path`; what was written there then takes the place of `path`.
+
+    Parameters
+    ----------
+    path : str or Path
+        Final name; a link is followed.
+    folder : bool
+        Whether a folder is written, which may replace an older folder.
+
+    Raises
+    ------
+    InputError
+        If the parent folder is missing or the disk refuses; nothing is left behind then.
+    """
+    target = Path(os.path.realpath(path))
+    if not target.parent.is_dir():
+        raise InputError(f"{path} cannot be written: there is no folder {target.parent}.")
+    if target.is_dir() and not folder:
+        raise InputError(f"{path} cannot be written: it is a folder; give the name of a file.")
+    token = uuid4().hex[:8]
+    temporary = target.with_name(f".{target.stem}-{token}{target.suffix}")
+    try:
+        yield temporary
+        flush(temporary)
+        if target.is_dir():  # a full folder cannot be replaced in one step, only swapped
+            older = target.with_name(f".{target.stem}-{token}-older")
+            os.replace(target, older)
+            os.replace(temporary, target)
+            shutil.rmtree(older)
+        else:
+            os.replace(temporary, target)
+    except OSError as error:
+        raise InputError(f"{path} could not be written: {error.strerror or error}.") from error
+    finally:
+        if temporary.is_dir():
+            shutil.rmtree(temporary)
+        else:
+            temporary.unlink(missing_ok=True)
+
+
+def flush(path: Path) -> None:
+    """Hand a file, or all files of a folder, from the system's cache to the disk itself."""
+    for file in path.rglob("*") if path.is_dir() else [path]:
+        if file.is_file():
+            with file.open("rb+") as stream:
+                os.fsync(stream.fileno())
+
+
+def existing(path: str | Path) -> Path:
+    """Return `path`, or say that nothing is there."""
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"There is no file {path}.")
+    return path
+
+
+@contextmanager
+def reading(path: Path, kind: str) -> Iterator[None]:
+    """Turn whatever a reader of `kind` raises at a damaged or foreign file into an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # the readers' libraries fail on bad bytes in a dozen ways
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"{path} cannot be read as {kind}; it may be cut short or of another kind ({reason})."
+        ) from error
+
+
+def check_size(path: Path, needed: int) -> None:
+    """Refuse a file whose header promises more bytes than its size can hold, compressed or not."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    held = sum(file.stat().st_size for file in files if file.is_file())
+    if needed > _DENSEST * held:
+        raise InputError(
+            f"{path} promises {needed:,} bytes of data but is only {held:,} bytes long; "
+            "it is cut short or its header is wrong."
+        )

@@ -1,0 +1,280 @@
+import json
+from dataclasses import replace
+from importlib.resources import files as package_files
+
+import numpy as np
+import pytest
+import torch
+from tmm import coh_tmm
+from typer.testing import CliRunner
+
+from squilla.cli.filters import app
+from squilla.errors import InputError
+from squilla.optics import filters as optics
+from squilla.optics.filters import FilterArray, MeasuredFilters, StencilRecipe, read_filters
+from squilla.optics.materials import refractive_index
+from squilla.spectra import grid
+
+IMEC = package_files("squilla") / "data" / "responses" / "spectral_responses_5x5.mat"
+
+
+def bell(centre, width=15.0):
+    wavelength = grid(400, 800)
+    return MeasuredFilters(
+        wavelength, np.exp(-(((wavelength[None] - np.atleast_1d(centre)[:, None]) / width) ** 2))
+    )
+
+
+# --- the stencil process ----------------------------------------------------------------------
+
+
+def test_recipe_is_followed():
+    recipe = StencilRecipe()
+    for seed in range(20):
+        array = recipe.draw(seed)
+        high = np.array([name.startswith("TiO2") for name in array.material])
+        assert high[0]
+        assert high[-1]
+        assert np.all(high[1:] != high[:-1])
+        thickness = array.thickness.numpy()
+        assert np.all((thickness[high] >= 25) & (thickness[high] <= 145))
+        assert np.all((thickness[~high] >= 45) & (thickness[~high] <= 255))
+        absent = (~array.layers).sum(-1)
+        assert absent.min() >= 2
+        assert absent.max() <= 5
+        assert len(torch.unique(array.layers, dim=0)) == 36
+
+
+def test_every_number_of_omitted_layers_is_drawn():
+    absent = (~StencilRecipe(filters=200).draw(3).layers).sum(-1)
+    assert set(absent.tolist()) == {2, 3, 4, 5}
+
+
+def test_same_seed_same_array():
+    once, again, other = (StencilRecipe().draw(seed) for seed in (4, 4, 5))
+    assert torch.equal(once.thickness, again.thickness)
+    assert torch.equal(once.layers, again.layers)
+    assert not torch.equal(once.thickness, other.thickness)
+    generator = torch.Generator().manual_seed(4)
+    assert torch.equal(StencilRecipe().draw(generator).layers, once.layers)
+
+
+def test_impossible_recipes_are_refused():
+    with pytest.raises(InputError, match="3 ways"):
+        StencilRecipe(filters=4, depositions=3, omitted=(1, 1))
+    with pytest.raises(InputError, match="cannot lack"):
+        StencilRecipe(depositions=3, omitted=(2, 5))
+
+
+def test_plate_with_film_agrees_with_tmm():
+    """Film by tmm, the glass' back face by summing the light that runs to and fro in the plate."""
+    array = replace(StencilRecipe(low="SiO2/Malitson").draw(1), scatter=0.9)
+    wavelength, angle = np.array([520.0, 640.0]), 0.25
+    result = array.transmittance(wavelength, angle)
+    for m in (0, 17):
+        for k, lam in enumerate(wavelength):
+            stack = [
+                (refractive_index(name, lam)[0].real, float(d))
+                for name, d, there in zip(
+                    array.material, array.thickness, array.layers[m], strict=True
+                )
+                if there
+            ][::-1]  # light meets the last deposition first
+            glass = refractive_index(array.substrate, lam)[0].real
+            inside = np.arcsin(np.sin(angle) / glass)
+            total = 0
+            for polarization in "sp":
+                film = coh_tmm(
+                    polarization, [1, *(n for n, _ in stack), glass],
+                    [np.inf, *(d for _, d in stack), np.inf], angle, lam,
+                )  # fmt: skip
+                back = coh_tmm(polarization, [glass, 1], [np.inf, np.inf], inside, lam)
+                rounds = ((1 - film["T"]) * back["R"]) ** np.arange(60)
+                total += film["T"] * back["T"] * rounds.sum() / 2
+            assert result[m, k].item() == pytest.approx(0.9 * total, abs=1e-5)
+
+
+def test_angles_become_the_first_axis():
+    array = StencilRecipe(filters=5).draw(0)
+    wavelength = grid(500, 750, 10)
+    both = array.transmittance(wavelength, [0.0, 0.2])
+    assert both.shape == (2, 5, 26)
+    assert both.dtype == torch.float64
+    for angle, part in zip((0.0, 0.2), both, strict=True):
+        torch.testing.assert_close(part, array.transmittance(wavelength, angle))
+
+
+def test_stack_shifts_to_the_blue_by_the_effective_index():
+    """A tilted array looks as the shift model with one n_eff near 1.75 says."""
+    array = StencilRecipe().draw(2)
+    wavelength = grid(480, 800)
+    flat = MeasuredFilters(wavelength, array.transmittance(wavelength).numpy(), n_eff=1.75)
+    true = array.transmittance(grid(), 0.15)
+    unshifted = (array.transmittance(grid()) - true).abs().mean()
+    assert (flat.transmittance(grid(), 0.15) - true).abs().mean() < 0.25 * unshifted
+
+
+def test_array_survives_its_file(tmp_path):
+    array = StencilRecipe().draw(6)
+    array.save(tmp_path / "array.toml")
+    again = read_filters(tmp_path / "array.toml")
+    assert isinstance(again, FilterArray)
+    assert torch.equal(again.transmittance(grid()), array.transmittance(grid()))
+
+
+# --- measured tables --------------------------------------------------------------------------
+
+
+def test_imec_responses():
+    table = read_filters(str(IMEC), wavelength=grid(400, 1000))
+    assert isinstance(table, MeasuredFilters)
+    response = table.transmittance(grid(600, 800))
+    assert response.shape == (25, 201)
+    from scipy.io import loadmat
+
+    file = loadmat(str(IMEC))
+    peak = grid(400, 1000)[table.values.argmax(-1)]
+    # The maker's central wavelengths are of the main peaks, of which a few lie elsewhere.
+    assert np.median(np.abs(peak - file["CentralWavelengths"].ravel())) < 10
+
+
+def test_mat_without_wavelength_asks_for_it():
+    with pytest.raises(InputError, match="wavelength="):
+        read_filters(str(IMEC))
+    with pytest.raises(InputError, match="601"):
+        read_filters(str(IMEC), wavelength=grid(400, 999))
+
+
+def test_every_kind_of_table_reads_alike(tmp_path):
+    import xarray
+    from scipy.io import savemat
+
+    truth = bell([520, 600, 680])
+    wavelength, values = truth.wavelength, truth.values
+    columns = np.column_stack([wavelength, values.T])
+    np.savetxt(tmp_path / "t.csv", columns, "%.17g", ",", header="wavelength,a,b,c", comments="")
+    np.save(tmp_path / "t.npy", values)
+    np.savez(tmp_path / "t.npz", wavelength=wavelength, filters=values)
+    savemat(tmp_path / "t.mat", {"Wavelength": wavelength[::-1], "T": values.T[::-1]})
+    xarray.DataArray(
+        values.T, dims=("wavelength", "filter"), coords={"wavelength": wavelength}, name="t"
+    ).to_netcdf(tmp_path / "t.nc", engine="h5netcdf")
+    for suffix in ("csv", "npy", "npz", "mat", "nc"):
+        own = {"wavelength": wavelength} if suffix == "npy" else {}
+        table = read_filters(tmp_path / f"t.{suffix}", **own)
+        np.testing.assert_array_equal(table.wavelength, wavelength)
+        np.testing.assert_array_equal(table.values, values)
+
+
+def test_shift_moves_a_peak_where_the_model_says():
+    table = replace(bell(600.0), n_eff=1.8)
+    wavelength = grid(500, 700, 0.1)
+    angle = np.array([0.0, 0.1, 0.3])
+    peak = wavelength[table.transmittance(wavelength, angle)[:, 0].argmax(-1)]
+    np.testing.assert_allclose(peak, 600 * np.sqrt(1 - (np.sin(angle) / 1.8) ** 2), atol=0.51)
+    unshifted = bell(600.0).transmittance(wavelength, angle)
+    assert torch.equal(unshifted[0], unshifted[2])
+
+
+def test_nothing_is_extrapolated_but_the_shift_at_the_edge():
+    table = replace(bell(790.0), n_eff=1.8)
+    assert torch.isfinite(table.transmittance(grid(500, 800), 0.3)).all()
+    with pytest.raises(InputError, match="400-800 nm"):
+        table.transmittance(grid(500, 801))
+    with pytest.raises(InputError, match="400-800 nm"):
+        table.transmittance(grid(399, 800), 0.3)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("t.xlsx", "", "expected .toml"),
+        ("t.csv", "500,0.1\n501,nan\n", "NaN"),
+        ("t.mat", "no matlab", "cannot be read"),
+        ("t.toml", "layers = ['01']", "no filter array"),
+        ("t.toml", "layers = ['02']", "no filter array"),
+    ],
+)
+def test_bad_files(tmp_path, name, content, message):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_filters(tmp_path / name)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(InputError, match="no file"):
+        read_filters(tmp_path / "none.csv")
+
+
+# --- figures of merit -------------------------------------------------------------------------
+
+
+def test_merit_of_perfect_filters():
+    """Ideal band-pass filters side by side: orthogonal, equally strong."""
+    response = torch.eye(5, dtype=torch.float64).repeat_interleave(4, -1)  # (5, 20)
+    assert optics.condition_number(response) == pytest.approx(1)
+    assert optics.singular_values(response).tolist() == pytest.approx([1] * 5)
+    assert optics.throughput(response) == pytest.approx(0.2)
+    assert optics.mutual_coherence(response[:, ::4]) == 0
+    assert optics.mutual_coherence(response) == pytest.approx(1)
+    # of rows that are 1 on a fifth of the band: cov = -1/25, var = 4/25
+    assert optics.mean_correlation(response) == pytest.approx(0.25)
+
+
+def test_correlation_agrees_with_numpy_and_ignores_scale_and_offset():
+    response = torch.rand(6, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    table = np.abs(np.corrcoef(response.numpy()))
+    assert optics.mean_correlation(response) == pytest.approx(table[~np.eye(6, dtype=bool)].mean())
+    assert optics.mean_correlation(3 * response + 1) == pytest.approx(
+        float(optics.mean_correlation(response))
+    )
+
+
+def test_peaks_of_a_fringe_are_counted():
+    wavelength = grid(500, 750)
+    fringe = 0.5 + 0.4 * np.sin(2 * np.pi * (wavelength - 500) / 50)  # maxima at 512.5, 562.5 ...
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(251)
+    response = torch.from_numpy(np.stack([fringe, fringe + noise]))
+    assert optics.peak_density(response, wavelength) == pytest.approx(2.0)
+
+
+def test_random_arrays_resemble_the_published_kind():
+    """Mean transmittance near one half, filters weakly correlated, a peak or two per 100 nm."""
+    figures = []
+    for seed in range(12):
+        response = StencilRecipe().draw(seed).transmittance(grid())
+        figures.append(
+            [
+                float(optics.throughput(response)),
+                float(optics.mean_correlation(response)),
+                optics.peak_density(response, grid()),
+            ]
+        )
+    through, correlation, peaks = np.median(figures, 0)
+    assert 0.35 < through < 0.6
+    assert 0.2 < correlation < 0.45
+    assert 0.9 < peaks < 1.5
+
+
+# --- the command line -------------------------------------------------------------------------
+
+
+def test_analyse_thesis():
+    result = CliRunner().invoke(app, ["analyse", "thesis", "--seed", "3", "--json"])
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.output)
+    response = StencilRecipe().draw(3).transmittance(grid())
+    assert figures["throughput"] == pytest.approx(response.mean().item())
+    assert len(figures["singular_values"]) == 36
+    text = CliRunner().invoke(app, ["analyse", "thesis", "--seed", "3"])
+    assert f"{figures['throughput']:.3f}" in text.output
+
+
+def test_analyse_table():
+    result = CliRunner().invoke(app, ["analyse", str(IMEC), "--wavelength", "400:1000:1", "--json"])
+    assert json.loads(result.output)["wavelength"] == [400, 1000, 601]
+
+
+def test_analyse_refuses_nonsense():
+    for arguments in (["analyse", "thesisx"], ["analyse", "thesis", "--wavelength", "all"]):
+        assert isinstance(CliRunner().invoke(app, arguments).exception, InputError)
