@@ -364,7 +364,7 @@ def test_an_interrupted_save_leaves_the_old_file(saved, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr("os.replace", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(InputError, match="disk full"):
         model_class("mlp")(CAMERA).save(saved)
     assert saved.read_bytes() == before
     assert len(list(saved.parent.iterdir())) == 1

@@ -36,7 +36,7 @@ def train(
     """
     import squilla
 
-    if not output.resolve().parent.is_dir():
+    if not output.resolve().parent.is_dir():  # said now, not after an hour of training
         raise InputError(f"There is no folder {output.resolve().parent}; make it first.")
     trained = squilla.train(
         model,

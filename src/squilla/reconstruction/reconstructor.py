@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.resources import files as package_files
@@ -17,6 +16,7 @@ from squilla import __version__
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
+from squilla.files.disk import replacing
 
 if TYPE_CHECKING:
     from xarray import DataArray
@@ -249,7 +249,8 @@ class Reconstructor(nn.Module):
             "provenance": json.dumps(self.provenance),
         }
         content = save({key: value.contiguous() for key, value in tensors.items()}, metadata)
-        write_whole(Path(path), content)
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
 
 
 def consistent_scale(
@@ -391,15 +392,3 @@ def _check_camera(
             f"{path} was trained for a sensitivity that differs from the calibration's by "
             f"{difference:.1%} (at most {TOLERANCE:.0%} is allowed). Train a model for this camera."
         )
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that a reader sees the old content or the new, never a part."""
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"There is no folder {path.parent} for {path.name}; make it first.")
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
