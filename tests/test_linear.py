@@ -17,7 +17,7 @@ def camera():
 
 @pytest.fixture(scope="module")
 def moment(camera):
-    return second_moment(camera, count=4000)
+    return second_moment(camera)
 
 
 def noisy(y, snr, generator):

@@ -136,6 +136,8 @@ def test_wrong_shapes_are_refused(model, y, angle):
         model(y, angle[:5])
     with pytest.raises(InputError, match="NaN"):
         model(y, torch.full((24,), torch.nan))
+    with pytest.raises(InputError, match="no scale"):
+        model(y, scale="thesis")
 
 
 @torch.no_grad()
@@ -350,6 +352,11 @@ def test_solvers_have_nothing_to_save(tmp_path):
         load_model("ridge", CAMERA).save(tmp_path / "ridge.safetensors")
 
 
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match="no folder"):
+        model_class("mlp")(CAMERA).save(tmp_path / "nowhere" / "model.safetensors")
+
+
 def test_an_interrupted_save_leaves_the_old_file(saved, monkeypatch):
     before = saved.read_bytes()
 
@@ -357,7 +364,7 @@ def test_an_interrupted_save_leaves_the_old_file(saved, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr("os.replace", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(InputError, match="disk full"):
         model_class("mlp")(CAMERA).save(saved)
     assert saved.read_bytes() == before
     assert len(list(saved.parent.iterdir())) == 1

@@ -14,9 +14,7 @@ def train(
     calibration: Annotated[Path, typer.Option(help="Calibration of the camera, .nc.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Model file to write.")],
     model: Annotated[str, typer.Option(help="Network: mlp, cnn, rescnn, unet, respecnn.")] = "mlp",
-    noise: Annotated[
-        str, typer.Option(help="none, one SNR (20) or a range (15:20), dB.")
-    ] = "15:20",
+    noise: Annotated[str, typer.Option(help="none, 20 or 15:20 (dB, drawn evenly).")] = "15:20",
     spectra: Annotated[str, typer.Option(help="Prior: broad, gaussian, natural, line.")] = "broad",
     count: Annotated[int, typer.Option(help="Spectra in an epoch.")] = 8000,
     epochs: Annotated[int, typer.Option(help="Passes over as many spectra.")] = 500,
@@ -34,11 +32,11 @@ def train(
 ) -> None:
     """Train a network for a calibrated camera.
 
-    Example: squilla train --calibration camera.nc --model respecnn --noise 15:20 -o model.safetensors
+    Example: squilla train --calibration camera.nc --model respecnn -o model.safetensors
     """
     import squilla
 
-    if not output.resolve().parent.is_dir():
+    if not output.resolve().parent.is_dir():  # said now, not after an hour of training
         raise InputError(f"There is no folder {output.resolve().parent}; make it first.")
     trained = squilla.train(
         model,

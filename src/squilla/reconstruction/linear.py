@@ -1,5 +1,9 @@
 """The linear (Wiener) estimator, and the filling of invalid channels, which is the same algebra."""
 
+import math
+from functools import lru_cache
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,11 +67,17 @@ class Ridge(Reconstructor):
         return Ridge(self.calibration, snr, self.moment).to(self.matrix.device)
 
 
-def second_moment(calibration: Calibration, count: int = 20_000, seed: int = 0) -> Tensor:
-    """Return the mean of x x' over random spectra of the broad prior, (K, K), float64."""
-    generator = torch.Generator().manual_seed(seed)
-    spectra = broad_spectra(count, calibration.wavelength, generator=generator)
-    return (spectra.T @ spectra).double() / count
+def second_moment(calibration: Calibration) -> Tensor:
+    """Return the mean of x x' over 20 000 spectra of the broad prior, (K, K), float64."""
+    return _second_moment(tuple(calibration.wavelength.tolist()))
+
+
+@lru_cache(maxsize=4)  # every capture with an invalid pixel needs it
+def _second_moment(wavelength: tuple[float, ...]) -> Tensor:
+    spectra = broad_spectra(
+        20_000, np.array(wavelength), generator=torch.Generator().manual_seed(0)
+    )
+    return (spectra.T @ spectra).double() / len(spectra)
 
 
 def complete(
@@ -136,6 +146,8 @@ def _fill(y: Tensor, valid: Tensor, weights: Tensor, covariance: Tensor) -> Tens
 
 def _covariance(response: Tensor, moment: Tensor, snr: float) -> Tensor:
     """Return the second moment of noisy measurements, R S R' + sigma^2 I, (A, M, M)."""
+    if math.isnan(snr):
+        raise InputError("The signal-to-noise ratio is NaN; give a number of dB, or leave it out.")
     signal = response @ moment @ response.mT
     power = signal.diagonal(dim1=-2, dim2=-1).mean(-1)
     # Beyond 90 dB the rounding of float32 is the noise.

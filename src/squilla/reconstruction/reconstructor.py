@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.resources import files as package_files
@@ -18,6 +16,7 @@ from squilla import __version__
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
+from squilla.files.disk import replacing
 
 if TYPE_CHECKING:
     from xarray import DataArray
@@ -104,8 +103,11 @@ class Reconstructor(nn.Module):
         Raises
         ------
         InputError
-            If `y` has another number of channels, or `angle` another shape than the pixels.
+            If `y` has another number of channels, `angle` another shape than the pixels, or
+            `scale` another name.
         """
+        if scale not in ("consistent", "maximum"):
+            raise InputError(f"There is no scale {scale!r}; there are 'consistent' and 'maximum'.")
         y, angle = self._accepted(y, angle)
         pixels = y.shape[:-1]
         if y.numel() == 0:
@@ -247,7 +249,8 @@ class Reconstructor(nn.Module):
             "provenance": json.dumps(self.provenance),
         }
         content = save({key: value.contiguous() for key, value in tensors.items()}, metadata)
-        write_whole(Path(path), content)
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
 
 
 def consistent_scale(
@@ -389,14 +392,3 @@ def _check_camera(
             f"{path} was trained for a sensitivity that differs from the calibration's by "
             f"{difference:.1%} (at most {TOLERANCE:.0%} is allowed). Train a model for this camera."
         )
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that a reader sees the old content or the new, never a part."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as new:
-        new.write(content)
-    try:
-        os.replace(new.name, path)
-    except OSError:
-        os.unlink(new.name)
-        raise

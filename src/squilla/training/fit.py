@@ -1,7 +1,6 @@
 """Training: from a camera's calibration to a network that reconstructs for it."""
 
 import hashlib
-import io
 import json
 import math
 import time
@@ -15,11 +14,11 @@ from torch import Tensor, nn
 
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
+from squilla.files.disk import replacing
 from squilla.reconstruction.reconstructor import (
     Reconstructor,
     fingerprint,
     model_class,
-    write_whole,
 )
 from squilla.training.data import Samples
 from squilla.training.noise import Noise
@@ -118,8 +117,8 @@ def train(
     if checkpoint is not None and Path(checkpoint).exists():
         run.resume(Path(checkpoint))
     if log is not None:
-        lines = "".join(json.dumps(entry) + "\n" for entry in run.history)
-        write_whole(Path(log), lines.encode())
+        with replacing(log) as temporary:
+            temporary.write_text("".join(json.dumps(entry) + "\n" for entry in run.history))
     for epoch in _shown(range(len(run.history), epochs), name, epochs, run, progress):
         run.epoch(epoch)
         if log is not None:
@@ -205,17 +204,14 @@ class _Run:
 
     def write(self, path: Path) -> None:
         """Write everything from which `resume` goes on."""
-        content = io.BytesIO()
-        torch.save(
-            {
-                "identity": self._identity(),
-                "history": self.history,
-                "model": self.model.state_dict(),
-                "optimiser": self.optimiser.state_dict(),
-            },
-            content,
-        )
-        write_whole(path, content.getvalue())
+        state = {
+            "identity": self._identity(),
+            "history": self.history,
+            "model": self.model.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+        }
+        with replacing(path) as temporary:
+            torch.save(state, temporary)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of the same training."""
