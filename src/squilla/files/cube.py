@@ -357,15 +357,18 @@ def _read_tiff(path: Path) -> DataArray:
         first = tiff.pages.first
         check_size(path, len(tiff.pages) * first.nbytes)
         bands = np.stack([page.asarray() for page in tiff.pages])
+        if bands.ndim != 3:
+            raise InputError(f"{path} must hold one grey page for each band.")
         try:
             told = json.loads(first.description)
         except ValueError:
-            told = {}
-    if bands.ndim != 3:
-        raise InputError(f"{path} must hold one grey page for each band.")
-    coords = {}
-    for key in ("wavelength", "fwhm"):
-        if len(told.get(key, ())) == len(bands):
-            coords[key] = ("wavelength", np.array(told[key], float))
-    values = np.ascontiguousarray(bands.transpose(1, 2, 0))
-    return DataArray(values, coords, _DIMS, told.get("name", path.stem), told.get("attributes", {}))
+            told = None
+        if not isinstance(told, dict) or "wavelength" not in told:
+            told = {"name": path.stem, "attributes": {}}  # others' files describe other things
+        coords = {
+            key: ("wavelength", np.array(told[key], float))
+            for key in ("wavelength", "fwhm")
+            if key in told
+        }
+        values = np.ascontiguousarray(bands.transpose(1, 2, 0))
+        return DataArray(values, coords, _DIMS, told["name"], told["attributes"])
