@@ -464,6 +464,8 @@ def test_cubes_that_cannot_be_saved(tmp_path, cube):
             save(wrong, tmp_path / "c.nc")
     with pytest.raises(InputError, match="end in"):
         save(cube, tmp_path / "c.xlsx")
+    with pytest.raises(InputError, match="rename"):
+        save(cube, tmp_path / "c.nc", extra={"radiance": cube})
     (tmp_path / "file").touch()
     (tmp_path / "folder.nc").mkdir()
     (tmp_path / "things.zarr").mkdir()
