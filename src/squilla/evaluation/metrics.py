@@ -135,8 +135,8 @@ def ciede2000(
 ) -> np.ndarray:
     """Return the colour difference that the CIE 1931 observer sees between two cubes.
 
-    About 1 is just noticeable, 2 to 3 acceptable in print. Light outside the band is left out on
-    both sides, so metamers that differ only there count as equal.
+    About 1 is just noticeable. Light outside the band is left out on both sides, so metamers that
+    differ only there count as equal.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def _paired(
         np.asarray(each.transpose(..., "wavelength") if isinstance(each, DataArray) else each)
         for each in (cube, reference)
     )
-    if isinstance(cube, DataArray) and isinstance(reference, DataArray):
+    if all("wavelength" in getattr(each, "coords", ()) for each in (cube, reference)):
         here, there = (np.asarray(each["wavelength"], float) for each in (cube, reference))
         if len(here) != len(there) or not np.allclose(here, there, rtol=0, atol=1e-6):
             truth = resample(truth, there, here)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from xarray import DataArray
 
-from squilla.calibration.calibration import Lattice
 from squilla.errors import InputError
 from squilla.evaluation import captures, plots
 from squilla.evaluation.chart import COLOURS, patch_errors, patch_means
@@ -25,6 +24,8 @@ from squilla.spectra import chart_reflectances
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from squilla.calibration.calibration import Lattice
 
 
 # --- what goes in ---------------------------------------------------------------------------------
@@ -53,7 +54,7 @@ class Trial:
     text: str = ""
     light: np.ndarray | None = None
     raw: Raw | None = None
-    lattice: Lattice | None = None
+    lattice: "Lattice | None" = None
     before: np.ndarray | None = None
     after: np.ndarray | None = None
     disparity: np.ndarray | None = None
