@@ -117,8 +117,8 @@ def demo(
             "camera": twin.serial,
             "distance": f"{distance:g} mm",
             "SNR": f"{snr:g} dB",
-            "calibrated from": f"{learnt.provenance['sweep_steps']} narrow-band flats, white flats, "
-            "darks and one poster",
+            "calibrated from": f"{learnt.provenance['sweep_steps']} narrow-band flats, white "
+            "flats, darks and one poster",
             "software": f"squilla {__version__}, torch with {torch.get_num_threads()} threads",
         }
         write_report(

@@ -169,7 +169,7 @@ def _linearise(spectra: _Spectra, position: Tensor) -> tuple[Tensor, Tensor, Ten
     scale : Tensor, (M,), a of each unit
     along : Tensor, (M, 2), its residual's component along each slope of the template
     gram : Tensor, (2, 2), of the slopes
-    score : float, mean correlation with the template
+    score : float, mean correlation of each unit with the mean of the others
     """
     moved = spectra.at(position)
     template = moved.mean(0)
@@ -181,7 +181,10 @@ def _linearise(spectra: _Spectra, position: Tensor) -> tuple[Tensor, Tensor, Ten
     own = torch.einsum("hw,ahw->a", template, slopes.conj()).real
     along = torch.einsum("mhw,ahw->ma", moved, slopes.conj()).real - scale[:, None] * own
     energy = torch.view_as_real(moved).square().sum((1, 2, 3))
-    score = float((shared / (power * energy).sqrt().clamp_min(1e-20)).mean())
+    # Against the mean of the others: noise then scores zero.
+    units = len(moved)
+    others = (power - 2 * shared / units + energy / units**2).clamp_min(1e-20)
+    score = float(((shared - energy / units) / (others * energy).sqrt().clamp_min(1e-20)).mean())
     return scale, along, gram, score
 
 
@@ -215,7 +218,7 @@ def find_disparity(
     disparity : float
         px per lens pitch.
     score : float
-        Mean correlation of the units' features with their mean, 0..1.
+        Mean correlation of each unit's features with the mean of the others; 0 for noise.
     """
     whole = torch.fft.fft2(features)
     reference = int(np.abs(baseline).sum(1).argmin())
@@ -270,7 +273,7 @@ def find_offsets(features: Tensor, start: np.ndarray, reference: int) -> tuple[n
     offset : array, (M, 2)
         px; zero for the reference.
     score : float
-        Mean correlation of the units' features with their mean, 0..1.
+        Mean correlation of each unit's features with the mean of the others; 0 for noise.
     """
     whole = torch.fft.fft2(features)
     near = np.rint(start - start[reference])

@@ -37,19 +37,7 @@ def find_windows(flat: np.ndarray, shape: tuple[int, int], pitch: float) -> np.n
     InputError
         If no lattice of this shape is seen.
     """
-    block = 2
-    size = [length - length % block for length in flat.shape]
-    coarse = flat[: size[0], : size[1]]
-    coarse = coarse.reshape(size[0] // block, block, size[1] // block, block).mean((1, 3))
-    noise = 1.4826 * float(np.median(np.abs(coarse - np.median(coarse))))
-    bright = coarse > max(0.05 * float(np.percentile(coarse, 99)), 8 * noise)
-    label, _ = ndimage.label(ndimage.binary_erosion(bright, iterations=2))
-    boxes = [(index + 1, box) for index, box in enumerate(ndimage.find_objects(label)) if box]
-    middles = np.array([
-        [block * (part.start + part.stop - 1) / 2 + (block - 1) / 2 for part in box]
-        for _, box in boxes
-        if all(0.5 * pitch < block * (part.stop - part.start) < 1.2 * pitch for part in box)
-    ])  # fmt: skip
+    middles = _lit_areas(flat, pitch)
     units = shape[0] * shape[1]
     if len(middles) < max(2, units // 2):
         raise InputError(
@@ -67,13 +55,34 @@ def find_windows(flat: np.ndarray, shape: tuple[int, int], pitch: float) -> np.n
     every = np.stack([np.ones(units), rows, columns], -1)
     known = np.column_stack([np.ones(len(position)), position])
     fit, *_ = np.linalg.lstsq(known, middles, rcond=None)
-    fine = np.array([_middle_of_window(flat, guess, 0.47 * pitch) for guess in every @ fit])
+    fine = np.array([_middle_of_window(flat, guess, pitch) for guess in every @ fit])
     seen = np.isfinite(fine).all(1)
     if seen.sum() < max(3, units // 2):
         raise InputError("The edges of the sub-images are not sharp enough in the flat frame.")
     fit, *_ = np.linalg.lstsq(every[seen], fine[seen], rcond=None)
     fine[~seen] = (every @ fit)[~seen]
     return fine
+
+
+def _lit_areas(flat: np.ndarray, pitch: float) -> np.ndarray:
+    """Return the middles of separate bright areas of about the right size, (N, 2) px.
+
+    Filters differ in brightness, so several thresholds are tried and each area is taken from the
+    first that separates it.
+    """
+    block = max(1, round(pitch / 200))
+    size = [length - length % block for length in flat.shape]
+    coarse = flat[: size[0], : size[1]]
+    coarse = coarse.reshape(size[0] // block, block, size[1] // block, block).mean((1, 3))
+    middles = []
+    for level in (0.03, 0.06, 0.12, 0.25, 0.5):
+        label, _ = ndimage.label(coarse > level * float(np.percentile(coarse, 99)))
+        for box in ndimage.find_objects(label):
+            if all(0.7 * pitch < block * (part.stop - part.start) < 1.1 * pitch for part in box):
+                middle = [block * (part.start + part.stop) / 2 - 0.5 for part in box]
+                if all(np.abs(np.subtract(middle, other)).max() > pitch / 2 for other in middles):
+                    middles.append(middle)
+    return np.array(middles).reshape(-1, 2)
 
 
 def _index(middles: np.ndarray, pitch: float) -> np.ndarray:
@@ -93,38 +102,39 @@ def _index(middles: np.ndarray, pitch: float) -> np.ndarray:
     return np.rint((middles - middles[0]) @ np.linalg.inv(basis)).astype(int)
 
 
-def _middle_of_window(flat: np.ndarray, guess: np.ndarray, half: float) -> np.ndarray:
+def _middle_of_window(flat: np.ndarray, guess: np.ndarray, pitch: float) -> np.ndarray:
     """Return the middle between the half-level edges of a lit window, px; NaN if one is missing."""
-    middle = np.empty(2)
+    middle, half, reach = np.empty(2), 0.47 * pitch, round(0.1 * pitch)
     for axis in (0, 1):
         lines = flat if axis == 0 else flat.T
         y, x = guess[axis], guess[1 - axis]
         span = slice(max(int(x - half / 2), 0), int(x + half / 2))
         ends = []
         for side in (-1, 1):
-            # From 40 px inside the expected edge outwards.
-            path = np.rint(y + side * (half - 40 + np.arange(80))).astype(int)
+            # From well inside the expected edge outwards.
+            path = np.rint(y + side * (half - reach + np.arange(2 * reach))).astype(int)
             if path.min() < 0 or path.max() >= len(lines):
                 return np.full(2, np.nan)
             profile = lines[path, span].mean(1)
-            ends.append(path[0] + side * _half_level(profile))
+            ends.append(path[0] + side * _half_level(profile, pitch))
         middle[axis] = np.mean(ends)
     return middle
 
 
-def _half_level(profile: np.ndarray) -> float:
-    """Return where a profile that leaves a plateau has fallen to half of it, in samples."""
-    rough = int(np.argmax(profile < 0.5 * np.median(profile[:20])))
-    if rough < 14:
+def _half_level(profile: np.ndarray, pitch: float) -> float:
+    """Return where a profile that leaves a plateau has fallen to half of it, in samples.
+
+    The plateau slopes with the filter's angle; its line is drawn on through the penumbra, which is
+    about 0.02 pitches to each side of the edge.
+    """
+    rough = int(np.argmax(profile < 0.5 * np.median(profile[: len(profile) // 4])))
+    inside = np.arange(max(rough - round(0.08 * pitch), 0), rough - round(0.025 * pitch))
+    if len(inside) < 3:
         return np.nan
-    inside = np.arange(max(rough - 34, 0), rough - 11)
     slope, level = np.polyfit(inside, profile[inside], 1)
-    floor = profile[rough + 4 :].min() if rough + 4 < len(profile) else 0.0
-    plateau = level + slope * np.arange(len(profile))
-    share = (profile - floor) / (plateau - floor)
+    floor = profile[rough:].min()
+    share = (profile - floor) / (level + slope * np.arange(len(profile)) - floor)
     at = int(np.argmax(share < 0.5))
-    if at == 0:
-        return np.nan
     return at - 1 + (share[at - 1] - 0.5) / (share[at - 1] - share[at])
 
 

@@ -88,12 +88,6 @@ class ImageSensor:
             list(pool.map(take, range(_BANDS)))
         return frame
 
-    def read(self, rate: np.ndarray, exposure: float) -> np.ndarray:
-        """Return the frame that an exposure gives without noise or rounding, float64 DN."""
-        sensor = self.sensor
-        electrons = (rate * self.response + self.dark_rate).astype(np.float64) * exposure
-        return np.minimum(electrons, sensor.full_well) / sensor.gain + sensor.black_level
-
     def exposure_for(self, rate: np.ndarray, snr: float) -> float:
         """Return the exposure at which the pixels given have a wanted signal-to-noise ratio.
 

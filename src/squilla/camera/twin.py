@@ -374,15 +374,21 @@ class Blur:
     cycles: np.ndarray
 
     @classmethod
-    def of(cls, transfer: np.ndarray, cycles: np.ndarray, tolerance: float = 5e-3) -> "Blur":
-        """Separate a transfer function (A, K, F) to a relative tolerance by its SVD."""
+    def of(cls, transfer: np.ndarray, cycles: np.ndarray, tolerance: float = 6e-4) -> "Blur":
+        """Separate a transfer function (A, K, F) to a relative tolerance by its SVD.
+
+        Low frequencies weigh more, for pictures are made of them and light must not be lost.
+        """
         angles, bands, _ = transfer.shape
-        left, values, right = np.linalg.svd(transfer.reshape(angles * bands, -1), False)
+        importance = 1 / (cycles + 0.01)
+        left, values, right = np.linalg.svd(
+            (transfer * importance).reshape(angles * bands, -1), False
+        )
         lost = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1] / np.sum(values**2))
         rank = max(1, int(np.sum(lost > tolerance)))
         weight = (left[:, :rank] * values[:rank]).reshape(angles, bands, rank)
         weight = torch.from_numpy(weight).float().permute(0, 2, 1).contiguous()
-        return cls(weight, right[:rank], cycles)
+        return cls(weight, right[:rank] / importance, cycles)
 
     def on_grid(self, size: tuple[int, int]) -> Tensor:
         """Return each term on the grid of a real FFT, times the pixel's aperture, (r, ...)."""

@@ -235,7 +235,7 @@ def read_sweep(folder: Path) -> "Iterator[SweepStep]":
             values = [float(row[key]) for key in ("wavelength", "power", "bandwidth")]
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
-                f"{table}, line {number}: wanted are file, wavelength (nm), power and bandwidth (nm)."
+                f"{table}, line {number}: wanted are file, wavelength, power and bandwidth (nm)."
             ) from error
         yield SweepStep(read_raw(folder / name), *values)
 
