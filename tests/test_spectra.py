@@ -276,7 +276,7 @@ def test_rgb_agrees_with_colour_over_the_whole_band():
     xyz = colour.sd_to_XYZ(reflectance, observer, power, method="Integration") / 100
     white = colour.xy_to_XYZ(colour.XYZ_to_xy(colour.sd_to_XYZ(power, observer)))
     expected = colour.XYZ_to_sRGB(
-        xyz, colour.XYZ_to_xy(white), chromatic_adaptation_transform="Bradford"
+        xyz, colour.XYZ_to_xy(white), chromatic_adaptation_transform="XYZ Scaling"
     )
     light = power.values * wavelength
     found = rgb(surface * light, wavelength, white=light, exposure=1)
@@ -289,3 +289,5 @@ def test_composite_takes_the_thesis_bands():
     np.testing.assert_allclose(composite(cube, grid())[0, 0], [1, 0.5, 0.25])
     np.testing.assert_allclose(composite(cube, grid(), scale=2.0)[0, 0], [0.5, 0.25, 0.125])
     assert composite(np.zeros((2, 2, 251)), grid()).max() == 0
+    light = lights()[CHART_LIGHT]
+    np.testing.assert_allclose(composite(0.3 * light, grid(), white=light, scale=1), 0.3)

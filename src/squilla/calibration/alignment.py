@@ -1,10 +1,4 @@
-"""From a raw frame to the measurement: correct it, find the disparity, align the sub-images.
-
-The array is rigid, so one number, the disparity of the scene's plane, moves all sub-images. Filters
-change intensities from one sub-image to the next and may even invert them; the directions of edges
-they leave alone. So sub-images are compared by their double-angle gradient, which is the same for a
-step up and a step down.
-"""
+"""From a raw frame to the measurement: correct it, find the disparity, align the sub-images."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.disparity import edges, find_disparity
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 
@@ -80,8 +75,10 @@ def measure(
     if distance is not None:
         disparity, how = lattice.disparity(distance), "from the given distance"
     else:
+        noise = _noise_variance(views, pixels)
+        features = edges(views.image.numpy(), noise, views.bad.numpy())
         disparity, score = find_disparity(
-            edges(views.image), views.offset, lattice.baseline, lattice.disparity(nearest)
+            features, views.offset, lattice.baseline, lattice.disparity(nearest)
         )
         how = "from the scene"
         if score < _TEXTURED:
@@ -144,14 +141,7 @@ def sub_images(raw: Raw, lattice: Lattice, pixels: Pixels, margin: int) -> SubIm
     bad = np.empty(frame.shape, bool)
     exposure = np.float32(raw.exposure or 0.0)
     _correct(frame, bias, rate, exposure, flat, valid, np.float32(pixels.saturation), image, bad)
-    unit, row, column = np.nonzero(bad)
-    if len(unit) < bad.size // 100:  # single pixels; whole areas have no neighbours to take
-        near = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
-        y = np.clip(row[:, None] + near[:, 0], 0, bad.shape[1] - 1)
-        x = np.clip(column[:, None] + near[:, 1], 0, bad.shape[2] - 1)
-        good = ~bad[unit[:, None], y, x]
-        total = np.where(good, image[unit[:, None], y, x], 0).sum(1)
-        image[unit, row, column] = total / np.maximum(good.sum(1), 1)
+    _fill(image, bad)
     offset = lattice.centre - origin - (np.array(lattice.field) - 1) / 2 - margin
     saturated = float(np.mean(_inner(frame, margin) >= pixels.saturation))
     return SubImages(torch.from_numpy(image), torch.from_numpy(bad), offset, margin, saturated)
@@ -168,6 +158,23 @@ def _correct(frame, bias, rate, exposure, flat, valid, saturation, image, bad):
             wrong = not valid[unit, row, column] or level >= saturation
             bad[unit, row, column] = wrong
             image[unit, row, column] = (level - dark) / flat[unit, row, column] if not wrong else 0
+
+
+@numba.njit(parallel=True, cache=True)
+def _fill(image, bad):
+    units, rows, columns = image.shape
+    for unit in numba.prange(units):
+        for row in range(rows):
+            for column in range(columns):
+                if not bad[unit, row, column]:
+                    continue
+                total, count = 0.0, 0
+                for y in range(max(row - 1, 0), min(row + 2, rows)):
+                    for x in range(max(column - 1, 0), min(column + 2, columns)):
+                        if not bad[unit, y, x]:
+                            total += image[unit, y, x]
+                            count += 1
+                image[unit, row, column] = total / max(count, 1)
 
 
 def windows(image: np.ndarray, lattice: Lattice, margin: int) -> tuple[np.ndarray, np.ndarray]:
@@ -190,6 +197,12 @@ def windows(image: np.ndarray, lattice: Lattice, margin: int) -> tuple[np.ndarra
     return origin, images
 
 
+def _noise_variance(views: SubImages, pixels: Pixels) -> np.ndarray:
+    """Return the mean noise variance of each sub-image by the calibrated sensor, (M,) DN^2."""
+    signal = _inner(views.image, views.margin).mean((1, 2)).clamp_min(0).numpy()
+    return signal / pixels.gain + (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
+
+
 def _inner(images, margin: int):
     """Return pictures without their margin."""
     return images[:, margin : images.shape[1] - margin, margin : images.shape[2] - margin]
@@ -203,8 +216,7 @@ def _judge(views: SubImages, raw: Raw, pixels: Pixels) -> float:
             "light."
         )
     good = _inner(views.image, views.margin)[~_inner(views.bad, views.margin)]
-    shot = float(good.mean().clamp_min(0)) / pixels.gain if len(good) else 0.0
-    noise = shot + (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
+    noise = float(_noise_variance(views, pixels).mean())
     power = float(good.square().mean()) - noise if len(good) else 0.0
     if power <= noise:
         raise InputError(
@@ -233,196 +245,6 @@ def _fitting(raw: Raw, calibration: Calibration) -> tuple[Lattice, Pixels]:
             f"The raw frame is of camera {taken!r}, the calibration of {made!r}; use its own."
         )
     return lattice, pixels
-
-
-# --- disparity --------------------------------------------------------------------------------
-
-
-def edges(images: Tensor, smooth: float = 0.8) -> Tensor:
-    """Return the double-angle gradient of pictures, (gx + i gy)^2 / |g|, blind to contrast.
-
-    Parameters
-    ----------
-    images : Tensor, (M, H, W)
-    smooth : float
-        Standard deviation of the Gaussian smoothing before, px.
-
-    Returns
-    -------
-    Tensor, (M, H, W) complex64, tapered to zero at its border, of unit energy for each unit
-    """
-    reach = 3
-    tap = torch.arange(-reach, reach + 1, dtype=torch.float32)
-    bell = torch.exp(-(tap**2) / (2 * smooth**2))
-    bell = bell / bell.sum()
-    slope = tap * bell / (tap**2 * bell).sum()
-    padded = functional.pad(images[:, None], [reach] * 4, mode="replicate")
-    along_x = functional.conv2d(
-        functional.conv2d(padded, slope[None, None, None]), bell[None, None, :, None]
-    )
-    along_y = functional.conv2d(
-        functional.conv2d(padded, bell[None, None, None]), slope[None, None, :, None]
-    )
-    gradient = torch.complex(along_x[:, 0], along_y[:, 0])
-    strength = gradient.abs()
-    # The weakest edges are noise: their direction is shrunk to nothing.
-    floor = strength.flatten(1).median(1).values[:, None, None]
-    feature = gradient.square() / (strength + floor).clamp_min(1e-20)
-    taper = _taper(images.shape[-2])[:, None] * _taper(images.shape[-1])[None, :]
-    feature = (feature - feature.mean((-2, -1), keepdim=True)) * taper
-    energy = feature.abs().square().sum((-2, -1), keepdim=True).sqrt()
-    return feature / energy.clamp_min(1e-20)
-
-
-def _taper(size: int, share: float = 0.1) -> Tensor:
-    """Return a window that is one inside and falls to zero like a cosine at both ends."""
-    edge = max(2, round(share * size))
-    ramp = 0.5 - 0.5 * torch.cos(torch.pi * (torch.arange(edge) + 0.5) / edge)
-    return torch.cat([ramp, torch.ones(size - 2 * edge), ramp.flip(0)])
-
-
-def find_disparity(
-    features: Tensor, offset: np.ndarray, baseline: np.ndarray, largest: float
-) -> tuple[float, float]:
-    """Find the disparity of a plane from all sub-images at once.
-
-    Every unit's correlation with the reference is a surface over shifts; one disparity is a point
-    on each of them. The sum over the units has its highest peak at the truth, which a few joint
-    Gauss-Newton steps against the mean of the aligned features then place to a few hundredths of
-    a pixel.
-
-    Parameters
-    ----------
-    features : Tensor, (M, H, W) complex
-        Of `edges`.
-    offset : array, (M, 2)
-        Where each unit sees an infinitely distant point, against the reference pixel grid, px.
-    baseline : array, (M, 2)
-        Lens pitches.
-    largest : float
-        Largest disparity looked for, px per pitch.
-
-    Returns
-    -------
-    disparity : float
-        px per lens pitch.
-    score : float
-        Mean correlation of the units' features with their mean, 0..1.
-    """
-    spectra = torch.fft.fft2(features)
-    reference = int(np.abs(baseline).sum(1).argmin())
-    surfaces = torch.fft.ifft2(spectra * spectra[reference].conj()).real
-    step = 0.25 / max(float(np.abs(baseline).max()), 1e-9)
-    candidates = np.arange(-4 * step, largest + step, step)
-    shifts = offset - offset[reference] + candidates[:, None, None] * baseline  # (D, M, 2)
-    total = _sample_periodic(surfaces, torch.from_numpy(shifts).float()).sum(1)
-    disparity = float(candidates[int(total.argmax())])
-    direction = torch.from_numpy(baseline).float()
-    for _ in range(6):
-        step, score = _joint_step(
-            spectra, torch.from_numpy(offset + disparity * baseline), direction
-        )
-        disparity += step
-        if abs(step) < 1e-4:
-            break
-    return disparity, score
-
-
-def _sample_periodic(surfaces: Tensor, shifts: Tensor) -> Tensor:
-    """Read surfaces (M, H, W) bilinearly at shifts (D, M, 2) px, both periodic; (D, M)."""
-    _, height, width = surfaces.shape
-    unit = torch.arange(len(surfaces))
-    low = shifts.floor().long()
-    part = shifts - low
-    total = torch.zeros(shifts.shape[:-1])
-    for i in (0, 1):
-        for j in (0, 1):
-            weight = (part[..., 0] if i else 1 - part[..., 0]) * (
-                part[..., 1] if j else 1 - part[..., 1]
-            )
-            total += weight * surfaces[unit, (low[..., 0] + i) % height, (low[..., 1] + j) % width]
-    return total
-
-
-def _aligned(spectra: Tensor, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Shift features back by `position` (M, 2); return their spectra and the two frequencies."""
-    y = torch.fft.fftfreq(spectra.shape[-2])[:, None]
-    x = torch.fft.fftfreq(spectra.shape[-1])[None, :]
-    position = position.float()
-    phase = 2 * torch.pi * (position[:, 0, None, None] * y + position[:, 1, None, None] * x)
-    return spectra * torch.polar(torch.ones_like(phase), phase), y, x
-
-
-def _joint_step(spectra: Tensor, position: Tensor, direction: Tensor) -> tuple[float, float]:
-    """Return the Gauss-Newton step along one shared direction (M, 2), and the mean correlation.
-
-    With the template T, the mean of the aligned features, unit i sees a_i (T - step d_i . grad T).
-    """
-    moved, y, x = _aligned(spectra, position)
-    template = moved.mean(0)
-    power = template.abs().square().sum()
-    scale = (moved * template.conj()).real.sum((-2, -1)) / power
-    slopes = torch.stack([2j * torch.pi * frequency * template for frequency in (y, x)])
-    residual = moved - scale[:, None, None] * template
-    along = torch.einsum("mhw,ahw->ma", residual, slopes.conj()).real
-    gram = torch.einsum("ahw,bhw->ab", slopes, slopes.conj()).real
-    numerator = (scale[:, None] * along * direction).sum()
-    denominator = (
-        scale[:, None, None] ** 2 * gram * direction[:, :, None] * direction[:, None]
-    ).sum()
-    each = (moved * template.conj()).real.sum((-2, -1)) / (
-        power.sqrt() * moved.abs().square().sum((-2, -1)).sqrt()
-    ).clamp_min(1e-20)
-    return float(-numerator / denominator.clamp_min(1e-20)), float(each.mean())
-
-
-def find_offsets(features: Tensor, start: np.ndarray, reference: int) -> tuple[np.ndarray, float]:
-    """Find every unit's own shift against the reference, jointly; for calibration targets.
-
-    Parameters
-    ----------
-    features : Tensor, (M, H, W) complex
-        Of `edges`.
-    start : array, (M, 2)
-        Shifts to start from, px, within a few px.
-    reference : int
-
-    Returns
-    -------
-    offset : array, (M, 2)
-        px; zero for the reference.
-    score : float
-        Mean correlation of the units' features with their mean, 0..1.
-    """
-    spectra = torch.fft.fft2(features)
-    position = torch.from_numpy(start - start[reference]).double()
-    position += _peak(spectra, position, reference)
-    score = 0.0
-    for _ in range(8):
-        moved, y, x = _aligned(spectra, position)
-        template = moved.mean(0)
-        slopes = torch.stack([2j * torch.pi * frequency * template for frequency in (y, x)])
-        gram = torch.einsum("ahw,bhw->ab", slopes, slopes.conj()).real
-        scale = (moved * template.conj()).real.sum((-2, -1)) / template.abs().square().sum()
-        residual = moved - scale[:, None, None] * template
-        along = torch.einsum("mhw,ahw->ma", residual, slopes.conj()).real
-        step = -torch.linalg.solve(gram, along.T).T / scale[:, None]
-        position = position + step
-        position = position - position[reference].clone()
-        norm = moved.abs().square().sum((-2, -1)).sqrt() * template.abs().square().sum().sqrt()
-        score = float(((moved * template.conj()).real.sum((-2, -1)) / norm).mean())
-        if float(step.abs().max()) < 1e-3:
-            break
-    return position.numpy(), score
-
-
-def _peak(spectra: Tensor, position: Tensor, reference: int, reach: int = 12) -> Tensor:
-    """Return the shift of the highest correlation within `reach` px of each position, (M, 2)."""
-    moved, _, _ = _aligned(spectra, position)
-    surface = torch.fft.ifft2(moved * moved[reference].conj()).real
-    surface = torch.roll(surface, (reach, reach), (-2, -1))[:, : 2 * reach + 1, : 2 * reach + 1]
-    best = surface.flatten(1).argmax(1)
-    return torch.stack([best // (2 * reach + 1), best % (2 * reach + 1)], -1).double() - reach
 
 
 # --- resampling -------------------------------------------------------------------------------

@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-import torch
 from scipy import ndimage
 
-from squilla.calibration.alignment import edges, find_offsets, windows
+from squilla.calibration.alignment import windows
 from squilla.calibration.calibration import Lattice
+from squilla.calibration.disparity import edges, find_offsets
 from squilla.camera.design import CameraDesign
 from squilla.errors import InputError
 
@@ -199,7 +199,7 @@ def refine_with_target(
     origin, images = windows(corrected, at_target, margin)
     start = at_target.centre - origin - (np.array(lattice.field) - 1) / 2 - margin
     reference = lattice.reference
-    shift, score = find_offsets(edges(torch.from_numpy(images)), start, reference)
+    shift, score = find_offsets(edges(images), start, reference)
     if score < 0.3:
         raise InputError(
             f"The target's sub-images agree by {score:.2f} only; use a richly textured, evenly "
