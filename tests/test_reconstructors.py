@@ -254,9 +254,6 @@ def test_solvers_serve_cameras_of_other_bands(name, mosaic):
     y = torch.rand(2, 2, camera.filters, generator=torch.Generator().manual_seed(0)) + 0.5
     valid = torch.ones(y.shape, dtype=torch.bool)
     valid[0, 0, 3] = False
-    model = (
-        model_class(name)(camera, tolerance=0.5) if name == "twist" else load_model(name, camera)
-    )
     one = Measurement(y, valid, torch.zeros(2, 2), torch.zeros(2, 2))
     cube = untrained(name, camera).reconstruct(one)
     assert cube.shape == (2, 2, 61)
