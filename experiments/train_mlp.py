@@ -34,20 +34,22 @@ def main() -> None:
     calibration = squilla.load_calibration(options.calibration)
     options.work.mkdir(parents=True, exist_ok=True)
     options.output.parent.mkdir(parents=True, exist_ok=True)
+    checkpoint = options.work / "train_mlp.checkpoint"
     model = squilla.train(
         "mlp",
         calibration,
         noise=parse_noise(options.noise),
         count=32_768,
         epochs=options.epochs,
-        batch=512,
+        batch=256,
         learning_rate=1e-3,
         schedule="cosine",
         seed=options.seed,
         log=options.work / "train_mlp.jsonl",
-        checkpoint=options.work / "train_mlp.checkpoint",
+        checkpoint=checkpoint,
     )
     model.save(options.output, half=True)
+    checkpoint.unlink()
     print(table(squilla.load_model(options.output, calibration), calibration))
 
 

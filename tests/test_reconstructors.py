@@ -1,5 +1,7 @@
 """What every reconstructor must do, and the way through files and whole measurements."""
 
+from importlib.resources import files
+
 import numpy as np
 import pytest
 import torch
@@ -242,17 +244,20 @@ def test_every_model_has_a_line():
     assert all(models().values())
 
 
+@pytest.mark.parametrize("mosaic", ["4x4", "5x5"])
 @pytest.mark.parametrize("name", [name for name in MODELS if name not in NETWORKS])
-def test_solvers_load_for_measured_cameras(name):
-    from importlib.resources import files
-
-    path = files("squilla") / "data" / "responses" / "spectral_responses_4x4.mat"
-    response = loadmat(str(path))["SpectralProfiles"][:, 100:351:5]
-    camera = Calibration.from_sensitivity(response, np.arange(500.0, 751, 5))
-    spectrum = broad_spectra(3, camera.wavelength, generator=torch.Generator().manual_seed(0))
-    x = load_model(name, camera)(camera.project(spectrum))
-    assert x.shape == (3, 51)
-    assert x.isfinite().all()
+def test_solvers_serve_cameras_of_other_bands(name, mosaic):
+    """Mosaic sensors of 400-1000 nm, measured; the tables of natural spectra end before."""
+    path = files("squilla") / "data" / "responses" / f"spectral_responses_{mosaic}.mat"
+    response = loadmat(str(path))["SpectralProfiles"][:, ::10]
+    camera = Calibration.from_sensitivity(response, np.arange(400.0, 1001, 10))
+    y = torch.rand(2, 2, camera.filters, generator=torch.Generator().manual_seed(0)) + 0.5
+    valid = torch.ones(y.shape, dtype=torch.bool)
+    valid[0, 0, 3] = False
+    one = Measurement(y, valid, torch.zeros(2, 2), torch.zeros(2, 2))
+    cube = untrained(name, camera).reconstruct(one)
+    assert cube.shape == (2, 2, 61)
+    assert np.isfinite(cube).all()
 
 
 @pytest.mark.parametrize("name", NETWORKS)

@@ -9,10 +9,11 @@ from scipy.optimize import nnls
 from sklearn.linear_model import Lasso
 
 from random_camera import smooth_camera
+from squilla.calibration.calibration import Calibration
+from squilla.reconstruction.active_set import nonnegative_lasso
 from squilla.reconstruction.sparse import (
     NonNegative,
     Sparse,
-    _recover,
     gaussian_lines,
     two_step,
 )
@@ -43,11 +44,8 @@ def lasso(matrix, y, weight, tolerance, steps):
 
 
 def recover(matrix, y, ratio, tolerance=1e-12):
-    """Run the kernel on one matrix, (M, atoms), and pixels, (N, M); return heights and gaps."""
-    rows = np.ascontiguousarray(matrix)[None]
-    columns = np.ascontiguousarray(matrix.T)[None]
-    node = np.zeros(len(y), np.int64)
-    return _recover(rows, columns, node, y, ratio, tolerance, np.eye(matrix.shape[1]))
+    """Solve for one matrix, (M, atoms), and pixels, (N, M); return heights and gaps."""
+    return nonnegative_lasso(np.ascontiguousarray(matrix)[None], y, ratio, tolerance=tolerance)
 
 
 def test_orthonormal_atoms_are_soft_thresholded():
@@ -196,6 +194,29 @@ def test_every_pixel_uses_the_sensitivity_of_its_angle():
         rest = camera.project(model(y, given), angle) - y
         misfit[name] = float(rest.norm() / y.norm())
     assert misfit["own"] < 0.5 * misfit["none"]
+
+
+def test_lines_that_no_filter_sees_are_not_found(camera):
+    response = camera.sensitivity[0].copy()
+    response[:, 125:] = 0
+    blind = Calibration.from_sensitivity(response, camera.wavelength)
+    model = Sparse(blind)
+    y = measured(blind, 20, 30)
+    heights, _ = model.heights(y)
+    unseen = np.linalg.norm(model.columns[-1], axis=-1) < 1e-9
+    assert unseen.sum() > 50
+    assert (heights[:, unseen] == 0).all()
+    assert model(y).isfinite().all()
+
+
+def test_threads_and_pieces_make_no_difference(camera):
+    model = Sparse(camera)
+    y = measured(camera, 1200, 20).double().numpy()
+    one, _ = nonnegative_lasso(model.rows[-1:], y, 1e-3)
+    two, _ = nonnegative_lasso(model.rows[-1:], y, 1e-3, threads=3)
+    last, _ = nonnegative_lasso(model.rows[-1:], y[-1:], 1e-3)
+    np.testing.assert_array_equal(one, two)
+    np.testing.assert_array_equal(one[-1:], last)
 
 
 def test_coarse_grids_have_no_line_between_their_bands():

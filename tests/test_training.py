@@ -187,6 +187,9 @@ def test_senseless_settings_are_refused():
         train("mlp", CAMERA, epochs=0)
     with pytest.raises(InputError, match="no schedule"):
         train("mlp", CAMERA, schedule="linear")
+    for device in ("cuda:99", "abacus"):
+        with pytest.raises(InputError, match="no device"):
+            train("mlp", CAMERA, device=device)
     with pytest.raises(InputError, match="diverged"):
         train("mlp", CAMERA, **SHORT, learning_rate=1e9)
 
@@ -203,3 +206,19 @@ def test_noise_as_it_is_typed():
     for wrong in ("loud", "15-20", "20:15", "1:2:3", "nan", ""):
         with pytest.raises(InputError, match="none, 20 or 15:20"):
             parse_noise(wrong)
+
+
+def test_the_command_trains_and_tells(tmp_path):
+    from typer.testing import CliRunner
+
+    from squilla.cli.app import app
+
+    CAMERA.save(tmp_path / "camera.nc")
+    words = ["train", "--calibration", str(tmp_path / "camera.nc"), "--noise", "20", "--seed", "4",
+             "--epochs", "2", "--count", "50", "--json", "-o"]  # fmt: skip
+    result = CliRunner().invoke(app, [*words, str(tmp_path / "model.safetensors")])
+    told = json.loads(result.stdout)
+    assert (told["noise"], told["seed"], told["epochs"]) == ("20 dB", 4, 2)
+    assert load_model(tmp_path / "model.safetensors", CAMERA).provenance["seed"] == 4
+    result = CliRunner().invoke(app, [*words, str(tmp_path / "nowhere" / "model.safetensors")])
+    assert isinstance(result.exception, InputError)

@@ -127,10 +127,10 @@ class Reconstructor(nn.Module):
         lit = peak > 0
         y = y / torch.where(lit, peak, 1)
         x = self.estimate(y, angle).clamp_min(0)
+        factor = torch.where(finite, torch.where(lit, peak, 0), torch.nan)
         if self.trained and scale == "consistent":
-            x = x * consistent_scale(y, x, self.calibration, angle)
-        x = torch.where(lit, x * peak, 0)
-        return torch.where(finite, x, torch.nan)
+            factor = factor * consistent_scale(y, x, self.calibration, angle)
+        return x * factor
 
     def _accepted(self, y: Tensor, angle: Tensor | None) -> tuple[Tensor, Tensor | None]:
         y = torch.as_tensor(y, dtype=torch.float32)

@@ -1,36 +1,22 @@
 """Sparse recovery: the fewest Gaussian lines that explain a measurement.
 
 For every pixel, x = Psi s, where s minimises 1/2 ||y - R Psi s||^2 + weight ||s||_1, s >= 0.
-
-A spectrum needs a handful of lines, at most as many as there are filters. So the solver adds one
-line at a time to an active set and solves for the set exactly through its Cholesky factor, as
-Lawson and Hanson do without the l1 term; it ends at the exact optimum after some ten steps, each a
-few hundred nanoseconds to microseconds long, where first-order methods take thousands.
 """
 
 import math
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from squilla.calibration.calibration import Calibration
+from squilla.reconstruction.active_set import nonnegative_lasso
 from squilla.reconstruction.linear import SNR
 from squilla.reconstruction.reconstructor import Reconstructor
 
 ANGLES = 16
 """Field angles for which the sensitivity is set up; a pixel takes the nearest (0.3 % of R)."""
-
-_compiled = numba.njit(
-    # Freedoms that let sums run in vector registers, while NaN and infinity stay exact.
-    fastmath={"reassoc", "contract", "nsz"},
-    error_model="numpy",
-    nogil=True,
-    cache=True,
-)
 
 
 class Sparse(Reconstructor):
@@ -52,8 +38,7 @@ class Sparse(Reconstructor):
         Largest relative duality gap: the objective of each pixel is within this fraction of the
         minimum.
 
-    Source: thesis, section on sparse recovery; C. L. Lawson and R. J. Hanson, Solving Least
-    Squares Problems, ch. 23.
+    Source: thesis, section on sparse recovery.
     """
 
     name = "sparse"
@@ -67,8 +52,9 @@ class Sparse(Reconstructor):
         nodes, response = _responses(calibration)
         self.nodes = nodes
         atoms = gaussian_lines(calibration.wavelength)
-        height = np.linalg.norm(response[-1] @ atoms.T, axis=0) ** -0.5
-        self.atoms = atoms * height[:, None]
+        seen = np.linalg.norm(response[-1] @ atoms.T, axis=0)
+        # Where no filter looks, an atom keeps a finite height, and is never chosen.
+        self.atoms = atoms * np.maximum(seen, 1e-3 * seen.max())[:, None] ** -0.5
         self.columns = np.ascontiguousarray(self.atoms @ response.mT.numpy())
         self.rows = np.ascontiguousarray(self.columns.swapaxes(1, 2))
 
@@ -102,20 +88,17 @@ class Sparse(Reconstructor):
         return self._solve(y, angle, np.eye(len(self.atoms)))
 
     def _solve(self, y: Tensor, angle: Tensor | None, synthesis: np.ndarray):
-        def recover(pixels: slice):
-            return _recover(
-                self.rows, self.columns, node[pixels], measured[pixels],
-                self.ratio, self.tolerance, synthesis,
-            )  # fmt: skip
-
-        node = self._nearest(angle, len(y))
-        measured = y.double().cpu().numpy()
-        pieces = [slice(start, start + 512) for start in range(0, len(y), 512)]
-        # The kernel lets go of the interpreter's lock, so that plain threads run it in parallel,
-        # also when several threads reconstruct at once (numba's own thread pool cannot do that).
-        with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-            spectra, gap = zip(*threads.map(recover, pieces), strict=True)
-        return torch.from_numpy(np.concatenate(spectra)), torch.from_numpy(np.concatenate(gap))
+        solution, gap = nonnegative_lasso(
+            self.rows,
+            y.double().cpu().numpy(),
+            self.ratio,
+            columns=self.columns,
+            choice=self._nearest(angle, len(y)),
+            synthesis=synthesis,
+            tolerance=self.tolerance,
+            threads=torch.get_num_threads(),
+        )
+        return torch.from_numpy(solution), torch.from_numpy(gap)
 
     def _nearest(self, angle: Tensor | None, count: int) -> np.ndarray:
         """Return the index of the matrix that each pixel uses, (N,)."""
@@ -223,14 +206,14 @@ def two_step(
     -------
     Tensor, (N, atoms), float64; Tensor, (N,), the relative duality gaps
 
-    Source: Bioucas-Dias and Figueiredo, eq. 16 to 18 and section V.
+    Source: see `Twist`.
     """
     y = y.double()
     norm = torch.linalg.matrix_norm(matrix, 2)
     scaled, target = matrix / norm, y / norm
     weight = ratio * (target @ scaled).amax(-1, keepdim=True).clamp_min(0)
-    # A'A is singular, so that its smallest eigenvalue is no guide; of 1e-2 to 1e-5 this one, below
-    # what the authors try, ended soonest for broadband filters.
+    # A'A is singular, so that its smallest eigenvalue is no guide; of 1e-2, 1e-3, 1e-4 and 1e-5
+    # this one ended soonest for broadband filters.
     smallest = 1e-5
     rho = (1 - math.sqrt(smallest)) / (1 + math.sqrt(smallest))
     alpha = 1 + rho**2
@@ -287,198 +270,3 @@ def _responses(calibration: Calibration) -> tuple[np.ndarray, Tensor]:
     weights = calibration.angle_weights(torch.from_numpy(nodes)).double()
     at_nodes = torch.einsum("ba,amk->bmk", weights, calibration.sensitivities.double())
     return nodes, torch.cat([at_nodes, mean])
-
-
-# --- the kernel -----------------------------------------------------------------------------
-
-
-@_compiled
-def _dot(a, b):
-    total = 0.0
-    for i in range(a.size):
-        total += a[i] * b[i]
-    return total
-
-
-@_compiled
-def _correlate(rows, residual, correlation):
-    """Write rows' residual into `correlation`; four rows at a time keep the sums in registers."""
-    correlation[:] = 0.0
-    filters, atoms = rows.shape
-    whole = filters - filters % 4
-    for m in range(0, whole, 4):
-        for j in range(atoms):
-            correlation[j] += (
-                residual[m] * rows[m, j]
-                + residual[m + 1] * rows[m + 1, j]
-                + residual[m + 2] * rows[m + 2, j]
-                + residual[m + 3] * rows[m + 3, j]
-            )
-    for m in range(whole, filters):
-        for j in range(atoms):
-            correlation[j] += residual[m] * rows[m, j]
-
-
-@_compiled
-def _append(columns, active, factor, size, atom):
-    """Extend the Cholesky factor of the active Gram matrix; False if the atom depends on the set.
-
-    Row `size` of `factor` is written in any case.
-    """
-    column = columns[atom]
-    power = _dot(column, column)
-    rest = power
-    for i in range(size):
-        value = _dot(columns[active[i]], column)
-        for j in range(i):
-            value -= factor[i, j] * factor[size, j]
-        value /= factor[i, i]
-        factor[size, i] = value
-        rest -= value * value
-    if size == column.size or rest <= 1e-12 * power:
-        return False
-    factor[size, size] = math.sqrt(rest)
-    active[size] = atom
-    return True
-
-
-@_compiled
-def _solve_upper(factor, size, x):
-    """Solve L' x = x in place."""
-    for i in range(size - 1, -1, -1):
-        value = x[i] / factor[i, i]
-        x[i] = value
-        for j in range(i):
-            x[j] -= factor[i, j] * value
-
-
-@_compiled
-def _solve(factor, size, right, x):
-    """Solve L L' x = right."""
-    for i in range(size):
-        value = right[i]
-        for j in range(i):
-            value -= factor[i, j] * x[j]
-        x[i] = value / factor[i, i]
-    _solve_upper(factor, size, x)
-
-
-@_compiled
-def _drop(columns, active, factor, size, height, right):
-    """Take the atoms of height zero out of the active set; return its new size."""
-    kept = 0
-    first = size
-    for i in range(size):
-        if height[i] > 0:
-            height[kept], active[kept], right[kept] = height[i], active[i], right[i]
-            kept += 1
-        elif first == size:
-            first = i
-    for i in range(first, kept):
-        _append(columns, active, factor, i, active[i])
-    return kept
-
-
-@_compiled
-def _descend(columns, active, factor, size, height, right, wanted):
-    """Move the heights to the minimum over the active set, dropping atoms on the way."""
-    while size > 0:
-        _solve(factor, size, right, wanted)
-        step = 1.0
-        for i in range(size):
-            if wanted[i] <= 0:
-                step = min(step, height[i] / (height[i] - wanted[i]))
-        if step == 1.0:
-            height[:size] = wanted[:size]
-            return size
-        for i in range(size):
-            blocks = wanted[i] <= 0 and height[i] / (height[i] - wanted[i]) <= step
-            height[i] = 0.0 if blocks else height[i] + step * (wanted[i] - height[i])
-        size = _drop(columns, active, factor, size, height, right)
-    return size
-
-
-@_compiled
-def _exchange(columns, active, factor, size, height, right, atom, wanted):
-    """Put in an atom that depends on the active set, at the price of one that it replaces.
-
-    The residual stays; the sum of heights falls. Returns the new size.
-    """
-    share = wanted
-    share[:size] = factor[size, :size]
-    _solve_upper(factor, size, share)
-    amount = np.inf
-    out = 0
-    for i in range(size):
-        if share[i] > 0 and height[i] / share[i] < amount:
-            amount, out = height[i] / share[i], i
-    for i in range(size):
-        height[i] = max(height[i] - amount * share[i], 1e-300)
-    height[out] = 0.0
-    size = _drop(columns, active, factor, size, height, right)
-    height[size] = amount
-    return size
-
-
-@_compiled
-def _recover(rows, columns, node, y, ratio, tolerance, synthesis):
-    """Solve every pixel.
-
-    rows (B, M, atoms) and columns (B, atoms, M) hold the same matrices R Psi; node (N,) says which
-    of them a pixel uses. Returns s' synthesis, (N, .), and the relative duality gaps, (N,).
-    """
-    count, filters = y.shape
-    atoms = rows.shape[2]
-    result = np.zeros((count, synthesis.shape[1]))
-    gaps = np.zeros(count)
-    factor = np.zeros((filters + 1, filters + 1))
-    active = np.zeros(filters + 1, np.int64)
-    height = np.zeros(filters + 1)
-    right = np.zeros(filters + 1)
-    wanted = np.zeros(filters + 1)
-    correlation = np.zeros(atoms)
-    residual = np.zeros(filters)
-    for n in range(count):
-        row, column, measured = rows[node[n]], columns[node[n]], y[n]
-        _correlate(row, measured, correlation)
-        peak = correlation.max()
-        if peak <= 0:
-            continue
-        weight = ratio * peak
-        size = 0
-        for _ in range(20 * (filters + 1)):
-            size = _descend(column, active, factor, size, height, right, wanted)
-            residual[:] = measured
-            for i in range(size):
-                for m in range(filters):
-                    residual[m] -= height[i] * column[active[i], m]
-            _correlate(row, residual, correlation)
-            best = correlation.argmax()
-            excess = correlation[best] - weight
-            # The residual, shrunk into the dual feasible set, bounds the minimum from below.
-            power = _dot(residual, residual)
-            fit = _dot(residual, measured)
-            objective = power / 2 + weight * height[:size].sum()
-            shrink = min(fit / power, weight / correlation[best]) if power > 0 else 0.0
-            gap = objective - shrink * (fit - shrink * power / 2)
-            gaps[n] = gap / objective if objective > 0 else 0.0
-            if ratio == 0 and excess <= 1e-10 * peak:
-                gaps[n] = 0.0
-            if gaps[n] <= tolerance:
-                break
-            if _append(column, active, factor, size, best):
-                height[size] = 0.0
-            else:
-                if excess <= 1e-10 * peak:  # only rounding is left
-                    break
-                size = _exchange(
-                    column, active, factor, size, height, right, best, wanted
-                )  # fmt: skip
-                if not _append(column, active, factor, size, best):
-                    break
-            right[size] = _dot(column[best], measured) - weight
-            size += 1
-        for i in range(size):
-            for k in range(synthesis.shape[1]):
-                result[n, k] += height[i] * synthesis[active[i], k]
-    return result, gaps

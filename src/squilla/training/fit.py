@@ -244,12 +244,13 @@ class _Run:
         return model
 
 
-def _device(device: str | None) -> torch.device:
-    if device is None:
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError(f"There is no device {device!r} here; use cpu.")
-    return torch.device(device)
+def _device(name: str | None) -> torch.device:
+    if name is None:
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError) as error:  # torch asserts that it was built with CUDA
+        raise InputError(f"There is no device {name!r} here; use cpu.") from error
 
 
 def _named(noise: Noise) -> str:
