@@ -30,7 +30,7 @@ def test_as_many_filters_as_bands_without_noise_is_inversion(moment):
     response = np.eye(51) + 0.1 * random.uniform(size=(51, 51))
     camera = Calibration.from_sensitivity(response, np.linspace(500, 750, 51))
     spectra = broad_spectra(50, camera.wavelength, generator=torch.Generator().manual_seed(1))
-    estimate = Ridge(camera, snr=90, moment=moment)(camera.project(spectra))
+    estimate = Ridge(camera, moment)(camera.project(spectra), snr=90.0)
     torch.testing.assert_close(estimate, spectra, atol=2e-3, rtol=0)
 
 
@@ -42,7 +42,7 @@ def test_no_other_matrix_does_better_on_the_prior(camera, moment):
     deviation = clean.square().mean().sqrt() * 10 ** (-20 / 20)
     y = clean + deviation * torch.randn(clean.shape, generator=generator)
     fitted = torch.linalg.lstsq(y.double(), spectra.double()).solution.float()
-    wiener = Ridge(camera, snr=20, moment=moment).matrix[-1]
+    wiener = Ridge(camera, moment).estimate(torch.eye(camera.filters))
     best = (y @ fitted - spectra).square().mean()
     assert (y @ wiener - spectra).square().mean() <= 1.01 * best
 
@@ -53,7 +53,8 @@ def test_noise_that_is_stated_right_is_reconstructed_best(camera, moment):
     for snr, wrong in ((15, 35), (35, 15)):
         y = noisy(camera.project(spectra), snr, generator)
         error = [
-            (Ridge(camera, stated, moment)(y) - spectra).square().mean() for stated in (snr, wrong)
+            (Ridge(camera, moment)(y, snr=stated) - spectra).square().mean()
+            for stated in (snr, wrong)
         ]
         assert error[0] < error[1]
 
@@ -78,7 +79,7 @@ def test_filled_channels_equal_channels_left_out(camera, moment):
     valid = torch.rand(y.shape, generator=generator) < 0.8
     filled = complete(torch.where(valid, y, 1e6), valid, one)
     moment = second_moment(one)
-    estimate = filled @ Ridge(one, 20, moment).matrix[-1]
+    estimate = filled @ Ridge(one, moment).estimate(torch.eye(one.filters))
     response = one.mean_sensitivity.double()
     noise = 10**-2 * (response @ moment @ response.T).diagonal().mean()
     enough = valid.sum(-1) >= 6

@@ -29,7 +29,8 @@ class Measurement:
     valid : (H, W, M) bool; False where saturated, defective or outside the sensor.
     angle : (H, W) field angle, rad.
     disparity : (H, W) px per lens pitch.
-    snr : signal-to-noise ratio of `y`, dB, by the sensor's calibrated noise; None if unknown.
+    snr : (H, W) signal-to-noise ratio of each point over its channels, dB, by the sensor's
+        calibrated noise; None if unknown.
     provenance : how it was made; plain numbers and strings.
     """
 
@@ -37,7 +38,7 @@ class Measurement:
     valid: Tensor
     angle: Tensor
     disparity: Tensor
-    snr: float | None = None
+    snr: Tensor | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
 
 
@@ -84,6 +85,7 @@ def measure(
         if score < _TEXTURED:
             disparity, how = lattice.disparity(lattice.usual), "no texture: at the usual distance"
     y, valid = align(views, lattice, disparity)
+    snr_of_point = _pointwise_snr(y, pixels)
     y = y / (raw.exposure or 1.0)
     shape = lattice.field
     return Measurement(
@@ -91,8 +93,9 @@ def measure(
         valid,
         torch.from_numpy(lattice.field_angle()).float(),
         torch.full(shape, float(disparity)),
-        snr,
+        snr_of_point,
         {
+            "snr": snr,
             "camera": raw.metadata.get("camera", "unknown"),
             "exposure": raw.exposure or 0.0,
             "disparity": disparity,
@@ -201,6 +204,13 @@ def _noise_variance(views: SubImages, pixels: Pixels) -> np.ndarray:
     """Return the mean noise variance of each sub-image by the calibrated sensor, (M,) DN^2."""
     signal = _inner(views.image, views.margin).mean((1, 2)).clamp_min(0).numpy()
     return signal / pixels.gain + (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
+
+
+def _pointwise_snr(y: Tensor, pixels: Pixels) -> Tensor:
+    """Return the signal-to-noise ratio of aligned points, (H, W, M) DN -> (H, W) dB."""
+    noise = y.mean(-1).clamp_min(0) / pixels.gain + (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
+    power = (y.square().mean(-1) - noise).clamp_min(0.1 * noise)
+    return 10 * torch.log10(power / noise)
 
 
 def _inner(images, margin: int):

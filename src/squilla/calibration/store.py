@@ -54,11 +54,10 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     encoding = {}
     if pixels is not None:
         for name in _FRAMES:
-            frame = getattr(pixels, name)
-            variables[name] = (("row", "column"), frame)
-            encoding[name] = _packing(frame)
+            variables[name] = (("row", "column"), *_packed(getattr(pixels, name)))
         variables["valid"] = (("row", "column"), pixels.valid.astype(np.uint8))
-        encoding["valid"] = {"zlib": True, "complevel": 1, "fletcher32": True}
+        checked = {"zlib": True, "complevel": 1, "shuffle": True, "fletcher32": True}
+        encoding = dict.fromkeys((*_FRAMES, "valid"), checked)
         for name in ("saturation", "gain", "read_noise"):
             attributes[f"pixels_{name}"] = float(getattr(pixels, name))
     dataset = xr.Dataset(variables, attrs=attributes)
@@ -117,16 +116,9 @@ def load_calibration(path: str | Path) -> Calibration:
         )
 
 
-def _packing(frame: np.ndarray) -> dict:
-    """Return the NetCDF encoding of a frame packed to 16 bits over its range."""
+def _packed(frame: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
+    """Pack a frame to 16 bits over its range, with the attributes that readers unpack it by."""
     low, high = float(frame.min()), float(frame.max())
-    return {
-        "dtype": "uint16",
-        "scale_factor": max(high - low, 1e-12) / 65535,
-        "add_offset": low,
-        "_FillValue": None,
-        "zlib": True,
-        "complevel": 1,
-        "shuffle": True,
-        "fletcher32": True,
-    }
+    scale = max(high - low, 1e-12) / 65535
+    packed = np.rint((frame - low) / scale).astype(np.uint16)
+    return packed, {"scale_factor": scale, "add_offset": low}

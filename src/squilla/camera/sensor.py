@@ -10,9 +10,10 @@ from torch import Generator
 from squilla.camera.design import CameraDesign
 from squilla.errors import InputError
 
-_MANY, _FEW = 200.0, 0.05
-"""Shot noise is drawn as normal above so many electrons, where its skewness is 7 %, and below so
-small a share of the read noise's variance, which drowns its shape; as Poisson's law in between."""
+_MANY, _FEW = 10.0, 0.05
+"""Shot noise is Poisson's law, drawn exactly up to so many electrons. Above, a normal number z gives
+mean + sqrt(mean) z + (z^2 - 1) / 6, which has its skewness too (Cornish and Fisher). Below so small a
+share of the read noise's variance it is added to that, which drowns its shape."""
 
 _BANDS = 16
 """Bands of rows with a random generator each, so that noise does not depend on the threads."""
@@ -149,10 +150,13 @@ def _expose(
             mean = (rate[row, column] * response[row, column] + dark[row, column]) * exposure
             electrons, variance = mean, read_noise**2
             if shot_noise:
-                if mean > _MANY or mean < _FEW * variance:
-                    variance += mean
-                else:
+                if mean > _MANY:
+                    normal = random.standard_normal()
+                    electrons = np.rint(mean + np.sqrt(mean) * normal + (normal**2 - 1) / 6)
+                elif mean > _FEW * variance:
                     electrons = float(random.poisson(mean))
+                else:
+                    variance += mean
             if variance > 0:
                 electrons += np.sqrt(variance) * random.standard_normal()
             # The top of the scale is the full well: clipping the number clips the electrons.

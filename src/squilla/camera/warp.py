@@ -4,11 +4,11 @@ import numba
 import numpy as np
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(nogil=True, cache=True)
 def add_flat(square, share, nodes, rates, total):
     """Add the light of an even surface to a window: share x rate at the squared field angle."""
     rows, columns = total.shape
-    for row in numba.prange(rows):
+    for row in range(rows):
         for column in range(columns):
             right, weight = _place(square[row, column], nodes)
             rate = (1 - weight) * rates[right - 1] + weight * rates[right]

@@ -172,7 +172,7 @@ def reconstruct(
         measurement = measure(read_raw(path), camera, distance=distance)
         target = output / f"{path.stem}.nc" if many else output
         save(reconstructor.reconstruct(measurement), target)
-        written.append({"file": str(target), "snr": measurement.snr, **measurement.provenance})
+        written.append({"file": str(target), **measurement.provenance})
     if as_json:
         typer.echo(json.dumps(written))
         return

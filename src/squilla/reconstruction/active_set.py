@@ -27,7 +27,7 @@ _compiled = numba.njit(
 def nonnegative_lasso(
     rows: np.ndarray,
     y: np.ndarray,
-    ratio: float,
+    ratio: float | np.ndarray,
     *,
     columns: np.ndarray | None = None,
     choice: np.ndarray | None = None,
@@ -42,8 +42,8 @@ def nonnegative_lasso(
     rows : array, (B, M, P), float64
         The matrices A, for M filters and P atoms.
     y : array, (N, M), float64
-    ratio : float
-        The weight as a fraction of ||A' y||_inf; 0 for non-negative least squares.
+    ratio : float or array, (N,)
+        The weight as a fraction of ||A' y||_inf, of each pixel; 0 for non-negative least squares.
     columns : array, (B, P, M), optional
         The same matrices transposed, to save transposing them.
     choice : array, (N,), optional
@@ -65,10 +65,11 @@ def nonnegative_lasso(
     columns = np.ascontiguousarray(rows.swapaxes(1, 2)) if columns is None else columns
     choice = np.zeros(len(y), np.int64) if choice is None else choice
     synthesis = np.eye(rows.shape[2]) if synthesis is None else synthesis
+    ratio = np.broadcast_to(np.asarray(ratio, float), len(y)).copy()
 
     def solve(pixels: slice):
         return _solve_pixels(
-            rows, columns, choice[pixels], y[pixels], ratio, tolerance, synthesis
+            rows, columns, choice[pixels], y[pixels], ratio[pixels], tolerance, synthesis
         )  # fmt: skip
 
     # The kernel lets go of the interpreter's lock, so that plain threads run it in parallel, also
@@ -227,7 +228,7 @@ def _solve_pixels(rows, columns, choice, y, ratio, tolerance, synthesis):
         peak = correlation.max()
         if peak <= 0:
             continue
-        weight = ratio * peak
+        weight = ratio[n] * peak
         size = 0
         for _ in range(20 * (filters + 1)):
             size = _descend(column, active, factor, size, height, right, wanted)
@@ -245,7 +246,7 @@ def _solve_pixels(rows, columns, choice, y, ratio, tolerance, synthesis):
             shrink = min(fit / power, weight / correlation[best]) if power > 0 else 0.0
             gap = objective - shrink * (fit - shrink * power / 2)
             gaps[n] = gap / objective if objective > 0 else 0.0
-            if ratio == 0 and excess <= 1e-10 * peak:
+            if ratio[n] == 0 and excess <= 1e-10 * peak:
                 gaps[n] = 0.0
             if gaps[n] <= tolerance:
                 break

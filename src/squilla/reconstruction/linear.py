@@ -1,6 +1,5 @@
 """The linear (Wiener) estimator, and the filling of invalid channels, which is the same algebra."""
 
-import math
 from functools import lru_cache
 
 import numpy as np
@@ -20,17 +19,16 @@ class Ridge(Reconstructor):
     """The best linear estimator for the broad prior: x = S R' (R S R' + sigma^2 I)^-1 y.
 
     S is the second moment of the spectra (their mean is not taken off, so that twice the light
-    gives twice the spectrum). Negative values of the estimate are clipped to zero, which moves
-    every spectrum nearer to the truth or leaves it.
+    gives twice the spectrum). In the eigenvectors of R S R' = U L U' the noise of each pixel,
+    sigma^2, only divides by another L + sigma^2, so every pixel is treated by its own. Negative
+    values of the estimate are clipped to zero, which moves every spectrum nearer to the truth or
+    leaves it.
 
     Parameters
     ----------
     calibration : Calibration
-        With several field angles, there is one matrix for each and the estimates of a pixel are
-        interpolated in between.
-    snr : float, optional
-        Signal-to-noise ratio of the measurements, dB. Default: that of each measurement given to
-        `reconstruct`, or 20 where it is unknown.
+        With several field angles, there is one estimator for each and the estimates of a pixel
+        are interpolated in between.
     moment : Tensor, (K, K), optional
         Second moment of the spectra; default: that of the broad prior.
 
@@ -38,32 +36,41 @@ class Ridge(Reconstructor):
     """
 
     name = "ridge"
-    matrix: Tensor
+    piece = 8192
+    basis: Tensor
+    power: Tensor
+    gain: Tensor
 
-    def __init__(
-        self, calibration: Calibration, snr: float | None = None, moment: Tensor | None = None
-    ):
+    def __init__(self, calibration: Calibration, moment: Tensor | None = None):
         super().__init__(calibration)
-        self.snr = snr
-        self.moment = second_moment(calibration) if moment is None else moment
+        moment = second_moment(calibration) if moment is None else moment
         response = calibration.sensitivities.double()
         response = torch.cat([response, calibration.mean_sensitivity.double()[None]])
-        covariance = _covariance(response, self.moment, SNR if snr is None else snr)
-        gain = torch.linalg.solve(covariance, response @ self.moment)  # (A + 1, M, K)
-        self.register_buffer("matrix", gain.float(), persistent=False)
+        power, basis = torch.linalg.eigh(response @ moment @ response.mT)  # (A + 1, M), (.., M, M)
+        self.register_buffer("basis", basis.float(), persistent=False)
+        self.register_buffer("power", power.clamp_min(0).float(), persistent=False)
+        self.register_buffer("gain", (basis.mT @ response @ moment).float(), persistent=False)
 
-    def estimate(self, y: Tensor, angle: Tensor | None) -> Tensor:
+    def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None) -> Tensor:
+        noise = _noise_to_signal(snr, len(y), y.device)[:, None]
         if angle is None:
-            return y @ self.matrix[-1]
+            power = self.power[-1]
+            return (y @ self.basis[-1] / (power + noise * power.mean())) @ self.gain[-1]
         weights = self.calibration.angle_weights(angle)
-        # One product for all angles: the channels, weighted by each angle, side by side.
-        weighted = (weights[..., None] * y[:, None, :]).flatten(1)
-        return weighted @ self.matrix[:-1].flatten(0, 1)
+        # One product for all angles: the components, weighted by each angle, side by side.
+        parts = [
+            weight[:, None] * (y @ basis) / (power + noise * power.mean())
+            for weight, basis, power in zip(weights.T, self.basis, self.power, strict=False)
+        ]
+        return torch.cat(parts, -1) @ self.gain[:-1].flatten(0, 1)
 
-    def tuned(self, snr: float | None) -> "Ridge":
-        if self.snr is not None or snr is None:
-            return self
-        return Ridge(self.calibration, snr, self.moment).to(self.matrix.device)
+
+def _noise_to_signal(snr: Tensor | None, count: int, device: torch.device) -> Tensor:
+    """Return the ratio of noise to signal power of each pixel, (N,); 20 dB where it is unknown."""
+    if snr is None:
+        return torch.full((count,), 10 ** (-SNR / 10), device=device)
+    # Beyond 90 dB the rounding of float32 is the noise.
+    return 10 ** (-snr.clamp_max(90.0) / 10)
 
 
 def second_moment(calibration: Calibration) -> Tensor:
@@ -109,7 +116,7 @@ def complete(
     valid: Tensor,
     calibration: Calibration,
     angle: Tensor | None = None,
-    snr: float | None = None,
+    snr: Tensor | None = None,
 ) -> Tensor:
     """Fill the invalid channels of each pixel with their linear estimate from the valid ones.
 
@@ -124,8 +131,8 @@ def complete(
     calibration : Calibration
     angle : Tensor, (...), optional
         Field angle, rad.
-    snr : float, optional
-        Signal-to-noise ratio, dB; default 20.
+    snr : Tensor, (...), optional
+        Signal-to-noise ratio of each pixel, dB; default 20.
 
     Returns
     -------
@@ -146,34 +153,27 @@ def complete(
     response = calibration.sensitivities.double() if angle is not None else None
     if response is None:
         response = calibration.mean_sensitivity.double()[None]
-    covariance = _covariance(
-        response, second_moment(calibration), SNR if snr is None else snr
-    ).float()
+    covariance = (response @ second_moment(calibration) @ response.mT).float()
     known = torch.where(valid, y, 0)[partial]
+    noise = _noise_to_signal(None if snr is None else snr[partial], len(known), y.device)
     weights = torch.ones(len(known), 1)
     if angle is not None:
         weights = calibration.angle_weights(angle[partial])
-    parts = zip(known.split(2048), valid[partial].split(2048), weights.split(2048), strict=True)
-    filled[partial] = torch.cat([_fill(*part, covariance) for part in parts])
+    parts = [
+        _fill(known[some], valid[partial][some], weights[some], noise[some], covariance)
+        for some in torch.arange(len(known)).split(2048)
+    ]
+    filled[partial] = torch.cat(parts)
     return filled
 
 
-def _fill(y: Tensor, valid: Tensor, weights: Tensor, covariance: Tensor) -> Tensor:
+def _fill(y: Tensor, valid: Tensor, weights: Tensor, noise: Tensor, covariance: Tensor) -> Tensor:
     """Return y, (N, M), with invalid channels replaced by C_iv C_vv^-1 y_v."""
-    full = torch.einsum("na,amk->nmk", weights, covariance)
+    signal = torch.einsum("na,amk->nmk", weights, covariance)
+    power = noise * signal.diagonal(dim1=-2, dim2=-1).mean(-1)
+    one = torch.eye(y.shape[-1])
     both = valid[:, :, None] & valid[:, None, :]
     # Rows of invalid channels become those of the identity: they decouple and stay zero.
-    reduced = torch.where(both, full, torch.eye(y.shape[-1]))
+    reduced = torch.where(both, signal + power[:, None, None] * one, one)
     explained = torch.linalg.solve(reduced, y)
-    return torch.where(valid, y, torch.einsum("nmk,nk->nm", full, explained))
-
-
-def _covariance(response: Tensor, moment: Tensor, snr: float) -> Tensor:
-    """Return the second moment of noisy measurements, R S R' + sigma^2 I, (A, M, M)."""
-    if math.isnan(snr):
-        raise InputError("The signal-to-noise ratio is NaN; give a number of dB, or leave it out.")
-    signal = response @ moment @ response.mT
-    power = signal.diagonal(dim1=-2, dim2=-1).mean(-1)
-    # Beyond 90 dB the rounding of float32 is the noise.
-    noise = power * 10 ** (-min(float(snr), 90.0) / 10)
-    return signal + noise[:, None, None] * torch.eye(response.shape[-2], dtype=torch.float64)
+    return torch.where(valid, y, torch.einsum("nmk,nk->nm", signal, explained))

@@ -33,7 +33,7 @@ class MLP(Reconstructor):
         last = nn.Linear(500, len(calibration.wavelength))
         self.layers = nn.Sequential(*(layer for pair in hidden for layer in pair), last)
 
-    def estimate(self, y: Tensor, angle: Tensor | None) -> Tensor:
+    def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None):
         return self.layers(y)
 
 
@@ -56,7 +56,7 @@ class CNN(Reconstructor):
         self.third = _convolution(64, 64)
         self.gather = nn.Linear(64 * (bands // 4), bands)
 
-    def estimate(self, y: Tensor, angle: Tensor | None) -> Tensor:
+    def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None):
         x = self.spread(y)[:, None]
         x = max_pool1d(relu(self.first(x)), 2)
         x = max_pool1d(relu(self.second(x)), 2)
@@ -91,7 +91,7 @@ class ResCNN(Reconstructor):
         )
         self.gather = nn.Linear(56 * bands, bands)
 
-    def estimate(self, y: Tensor, angle: Tensor | None) -> Tensor:
+    def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None):
         start = y @ self.lift
         x = start[:, None]
         for layer in self.layers:
@@ -126,7 +126,7 @@ class UNet(Reconstructor):
         self.last = nn.Conv1d(64, 1, 1)
         self.eval()
 
-    def estimate(self, y: Tensor, angle: Tensor | None) -> Tensor:
+    def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None):
         x = self.spread(y)
         bands = x.shape[-1]
         x = pad(x, (0, self.padding))[:, None]
@@ -158,7 +158,7 @@ class ReSpecNN(Reconstructor):
         self.layers = nn.ModuleList(_convolution(a, b) for a, b in pairwise([1, 64, 64, 64]))
         self.gather = nn.Linear(64 * bands, bands)
 
-    def estimate(self, y: Tensor, angle: Tensor | None) -> Tensor:
+    def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None):
         x = self.spread(y)[:, None]
         for layer in self.layers:
             x = relu(layer(x))

@@ -64,22 +64,20 @@ class Reconstructor(nn.Module):
         self.wavelength = calibration.wavelength
         self.provenance: dict[str, Any] = {}
 
-    def estimate(self, y: Tensor, angle: Tensor | None) -> Tensor:
+    def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None) -> Tensor:
         """Map finite measurements with a maximum of 1, (N, M), to spectra, (N, K).
 
         angle : (N,) rad, or None for the mean sensitivity.
+        snr : (N,) dB, or None where it is unknown; networks do without.
         """
         raise NotImplementedError
 
-    def tuned(self, snr: float | None) -> "Reconstructor":
-        """Return the reconstructor for measurements of this signal-to-noise ratio, dB.
-
-        Trained networks and estimators that know no noise level return themselves.
-        """
-        return self
-
     def forward(
-        self, y: Tensor, angle: Tensor | None = None, scale: Scale = "consistent"
+        self,
+        y: Tensor,
+        angle: Tensor | None = None,
+        snr: Tensor | float | None = None,
+        scale: Scale = "consistent",
     ) -> Tensor:
         """Reconstruct the spectrum of every pixel.
 
@@ -90,6 +88,8 @@ class Reconstructor(nn.Module):
             gives a spectrum of NaN; a pixel without any positive channel gives zero.
         angle : Tensor, (...), optional
             Field angle, rad; without it the mean sensitivity is used.
+        snr : Tensor, (...), or float, optional
+            Signal-to-noise ratio of each pixel, dB; without it 20 is assumed where it matters.
         scale : "consistent" or "maximum"
             What restores the scale of a network's output: "consistent" multiplies by
             <y, R x> / <R x, R x>, so that the spectrum explains the measurement; "maximum" by the
@@ -103,55 +103,47 @@ class Reconstructor(nn.Module):
         Raises
         ------
         InputError
-            If `y` has another number of channels, `angle` another shape than the pixels, or
-            `scale` another name.
+            If `y` has another number of channels, `angle` or `snr` another shape than the pixels,
+            or `scale` another name.
         """
         if scale not in ("consistent", "maximum"):
             raise InputError(f"There is no scale {scale!r}; there are 'consistent' and 'maximum'.")
-        y, angle = self._accepted(y, angle)
+        y, angle, snr = self._accepted(y, angle, snr)
         pixels = y.shape[:-1]
         if y.numel() == 0:
             return y.new_zeros(*pixels, len(self.wavelength))
         y = y.reshape(-1, y.shape[-1])
-        angles = None if angle is None else angle.reshape(-1).split(self.piece)
         parts = [
-            self._piece(part, None if angles is None else angles[index], scale)
-            for index, part in enumerate(y.split(self.piece))
-        ]
+            self._piece(y[some], None if angle is None else angle.reshape(-1)[some],
+                        None if snr is None else snr.reshape(-1)[some], scale)
+            for some in torch.arange(len(y), device=y.device).split(self.piece)
+        ]  # fmt: skip
         return torch.cat(parts).reshape(*pixels, len(self.wavelength))
 
-    def _piece(self, y: Tensor, angle: Tensor | None, scale: Scale) -> Tensor:
+    def _piece(self, y: Tensor, angle: Tensor | None, snr: Tensor | None, scale: Scale) -> Tensor:
         finite = y.isfinite().all(-1, keepdim=True)
         y = torch.where(finite, y, 0)
         peak = y.amax(-1, keepdim=True)
         lit = peak > 0
         y = y / torch.where(lit, peak, 1)
-        x = self.estimate(y, angle).clamp_min(0)
+        x = self.estimate(y, angle, snr).clamp_min(0)
         factor = torch.where(finite, torch.where(lit, peak, 0), torch.nan)
         if self.trained and scale == "consistent":
             factor = factor * consistent_scale(y, x, self.calibration, angle)
         return x * factor
 
-    def _accepted(self, y: Tensor, angle: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    def _accepted(
+        self, y: Tensor, angle: Tensor | None, snr: Tensor | float | None
+    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
         y = torch.as_tensor(y, dtype=torch.float32)
         if y.ndim == 0 or y.shape[-1] != self.calibration.filters:
             raise InputError(
                 f"The measurement has the shape {tuple(y.shape)}; its last axis must hold the "
                 f"{self.calibration.filters} channels of the calibration."
             )
-        if angle is None or len(self.calibration.angle) == 1:
-            return y, None
-        angle = torch.as_tensor(angle, dtype=torch.float32, device=y.device)
-        if angle.ndim == 0:
-            angle = angle.expand(y.shape[:-1])
-        if angle.shape != y.shape[:-1]:
-            raise InputError(
-                f"The field angles have the shape {tuple(angle.shape)}, but the measurement has "
-                f"the pixels {tuple(y.shape[:-1])}; give one angle per pixel, or one for all."
-            )
-        if not angle.isfinite().all():
-            raise InputError("The field angles hold NaN or infinite values; give rad.")
-        return y, angle
+        if len(self.calibration.angle) == 1:
+            angle = None
+        return y, _per_pixel(angle, y, "field angles"), _per_pixel(snr, y, "SNRs")
 
     def reconstruct(self, measurement: Measurement, scale: Scale = "consistent") -> "DataArray":
         """Reconstruct a whole measurement.
@@ -179,13 +171,11 @@ class Reconstructor(nn.Module):
             raise InputError(
                 f"A measurement has the shape (rows, columns, channels), not {tuple(y.shape)}."
             )
-        y, angle = self._accepted(y, measurement.angle)
-        y = complete(y, measurement.valid, self.calibration, angle, measurement.snr)
+        y, angle, snr = self._accepted(y, measurement.angle, measurement.snr)
+        y = complete(y, measurement.valid, self.calibration, angle, snr)
         device = next(iter([*self.parameters(), *self.buffers()]), y).device
         with torch.inference_mode():
-            cube = self.tuned(measurement.snr)(
-                y.to(device), None if angle is None else angle.to(device), scale
-            )
+            cube = self(y.to(device), angle, snr, scale)
         return self._labelled(cube.cpu().numpy(), measurement, scale)
 
     def _labelled(self, cube: np.ndarray, measurement: Measurement, scale: Scale) -> "DataArray":
@@ -197,7 +187,6 @@ class Reconstructor(nn.Module):
             "software": f"squilla {__version__}",
             "calibration": fingerprint(self.calibration),
             "scale": scale if self.trained else "solved",
-            "snr": "unknown" if measurement.snr is None else float(measurement.snr),
         }
         origin |= {f"model_{key}": value for key, value in self.provenance.items()}
         origin |= {f"measurement_{key}": value for key, value in measurement.provenance.items()}
@@ -251,6 +240,23 @@ class Reconstructor(nn.Module):
         content = save({key: value.contiguous() for key, value in tensors.items()}, metadata)
         with replacing(path) as temporary:
             temporary.write_bytes(content)
+
+
+def _per_pixel(value: Tensor | float | None, y: Tensor, what: str) -> Tensor | None:
+    """Return one finite number for each pixel of y, (...), or None."""
+    if value is None:
+        return None
+    value = torch.as_tensor(value, dtype=torch.float32, device=y.device)
+    if value.ndim == 0:
+        value = value.expand(y.shape[:-1])
+    if value.shape != y.shape[:-1]:
+        raise InputError(
+            f"The {what} have the shape {tuple(value.shape)}, but the measurement has the pixels "
+            f"{tuple(y.shape[:-1])}; give one per pixel, or one for all."
+        )
+    if not value.isfinite().all():
+        raise InputError(f"The {what} hold NaN or infinite values; give finite numbers.")
+    return value
 
 
 def consistent_scale(

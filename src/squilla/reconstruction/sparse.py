@@ -22,18 +22,15 @@ ANGLES = 16
 class Sparse(Reconstructor):
     """Non-negative l1 recovery over a dictionary of Gaussian lines of all widths.
 
-    The l1 weight follows the noise: 0.025 x 10^(-0.06 SNR) times the largest correlation
-    ||(R Psi)' y||_inf, that is 1.6e-3 at 20 dB. An atom has the height at which l1 counts it as 1,
-    the inverse square root of ||R psi||: with equal heights l1 favours broad lines too much, with
-    equal ||R psi|| narrow ones. Rule and heights were chosen on random natural, Gaussian and line
+    The l1 weight follows the noise of each pixel: 0.025 x 10^(-0.06 SNR) times the largest
+    correlation ||(R Psi)' y||_inf, that is 1.6e-3 at 20 dB. An atom has the height at which l1
+    counts it as 1, the inverse square root of ||R psi||: with equal heights l1 favours broad lines
+    too much, with equal ||R psi|| narrow ones. Rule and heights were chosen on random natural, Gaussian and line
     spectra at 15 to 40 dB.
 
     Parameters
     ----------
     calibration : Calibration
-    snr : float, optional
-        Signal-to-noise ratio of the measurements, dB. Default: that of each measurement given to
-        `reconstruct`, or 20 where it is unknown.
     tolerance : float
         Largest relative duality gap: the objective of each pixel is within this fraction of the
         minimum.
@@ -44,11 +41,9 @@ class Sparse(Reconstructor):
     name = "sparse"
     piece = 16384
 
-    def __init__(self, calibration: Calibration, snr: float | None = None, tolerance: float = 1e-6):
+    def __init__(self, calibration: Calibration, tolerance: float = 1e-6):
         super().__init__(calibration)
-        self.snr = snr
         self.tolerance = tolerance
-        self.ratio = 0.025 * 10 ** (-0.06 * (SNR if snr is None else snr))
         nodes, response = _responses(calibration)
         self.nodes = nodes
         atoms = gaussian_lines(calibration.wavelength)
@@ -58,8 +53,8 @@ class Sparse(Reconstructor):
         self.columns = np.ascontiguousarray(self.atoms @ response.mT.numpy())
         self.rows = np.ascontiguousarray(self.columns.swapaxes(1, 2))
 
-    def estimate(self, y: Tensor, angle: Tensor | None) -> Tensor:
-        spectra, gap = self._solve(y, angle, self.atoms)
+    def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None) -> Tensor:
+        spectra, gap = self._solve(y, angle, self.ratio(snr, len(y)), self.atoms)
         if not (gap <= self.tolerance).all():
             warnings.warn(
                 f"{self.name}: {int((gap > self.tolerance).sum())} pixels ended at a relative "
@@ -68,7 +63,14 @@ class Sparse(Reconstructor):
             )
         return spectra.to(y)
 
-    def heights(self, y: Tensor, angle: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def ratio(self, snr: Tensor | None, count: int) -> np.ndarray:
+        """Return the l1 weight of each pixel as a fraction of ||(R Psi)' y||_inf, (N,)."""
+        decibel = np.full(count, SNR) if snr is None else snr.double().cpu().numpy()
+        return 0.025 * 10 ** (-0.06 * decibel)
+
+    def heights(
+        self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return the solution itself instead of its spectrum.
 
         Parameters
@@ -76,6 +78,8 @@ class Sparse(Reconstructor):
         y : Tensor, (N, M)
         angle : Tensor, (N,), optional
             Field angle, rad.
+        snr : Tensor, (N,), optional
+            Signal-to-noise ratio, dB; default 20.
 
         Returns
         -------
@@ -85,13 +89,15 @@ class Sparse(Reconstructor):
             The relative duality gap: the objective exceeds its minimum by no more than this
             fraction.
         """
-        return self._solve(y, angle, np.eye(len(self.atoms)))
+        return self._solve(y, angle, self.ratio(snr, len(y)), np.eye(len(self.atoms)))
 
-    def _solve(self, y: Tensor, angle: Tensor | None, synthesis: np.ndarray):
+    def _solve(
+        self, y: Tensor, angle: Tensor | None, ratio: np.ndarray, synthesis: np.ndarray
+    ) -> tuple[Tensor, Tensor]:
         solution, gap = nonnegative_lasso(
             self.rows,
             y.double().cpu().numpy(),
-            self.ratio,
+            ratio,
             columns=self.columns,
             choice=self._nearest(angle, len(y)),
             synthesis=synthesis,
@@ -109,11 +115,6 @@ class Sparse(Reconstructor):
         position = (square - low) / (high - low) * (len(self.nodes) - 1)
         return np.rint(np.clip(position, 0, len(self.nodes) - 1)).astype(np.int64)
 
-    def tuned(self, snr: float | None) -> "Sparse":
-        if self.snr is not None or snr is None:
-            return self
-        return type(self)(self.calibration, snr, self.tolerance)
-
 
 class NonNegative(Sparse):
     """Non-negative least squares over the same Gaussian lines: `Sparse` without the l1 term.
@@ -124,12 +125,8 @@ class NonNegative(Sparse):
 
     name = "nnls"
 
-    def __init__(self, calibration: Calibration):
-        super().__init__(calibration)
-        self.ratio = 0.0
-
-    def tuned(self, snr: float | None) -> "NonNegative":
-        return self
+    def ratio(self, snr: Tensor | None, count: int) -> np.ndarray:
+        return np.zeros(count)
 
 
 class Twist(Sparse):
@@ -144,17 +141,21 @@ class Twist(Sparse):
     name = "twist"
     piece = 4096
 
-    def __init__(self, calibration: Calibration, snr: float | None = None, tolerance: float = 1e-2):
-        super().__init__(calibration, snr, tolerance)
+    def __init__(self, calibration: Calibration, tolerance: float = 1e-2):
+        super().__init__(calibration, tolerance)
 
-    def _solve(self, y: Tensor, angle: Tensor | None, synthesis: np.ndarray):
+    def _solve(
+        self, y: Tensor, angle: Tensor | None, ratio: np.ndarray, synthesis: np.ndarray
+    ) -> tuple[Tensor, Tensor]:
         node = self._nearest(angle, len(y))
         result = torch.zeros(len(y), synthesis.shape[1], dtype=torch.float64)
         gap = torch.zeros(len(y), dtype=torch.float64)
         for index in np.unique(node):
             here = torch.from_numpy(np.flatnonzero(node == index))
             matrix = torch.from_numpy(self.rows[index])
-            heights, gap[here] = two_step(matrix, y[here].cpu(), self.ratio, self.tolerance)
+            heights, gap[here] = two_step(
+                matrix, y[here].cpu(), torch.from_numpy(ratio)[here], self.tolerance
+            )
             result[here] = heights @ torch.from_numpy(synthesis)
         return result, gap
 
@@ -211,7 +212,7 @@ def two_step(
     y = y.double()
     norm = torch.linalg.matrix_norm(matrix, 2)
     scaled, target = matrix / norm, y / norm
-    weight = ratio * (target @ scaled).amax(-1, keepdim=True).clamp_min(0)
+    weight = (ratio * (target @ scaled).amax(-1).clamp_min(0))[:, None]
     # A'A is singular, so that its smallest eigenvalue is no guide; of 1e-2, 1e-3, 1e-4 and 1e-5
     # this one ended soonest for broadband filters.
     smallest = 1e-5
