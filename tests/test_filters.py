@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from squilla.cli.filters import app
 from squilla.errors import InputError
-from squilla.optics import filters as optics
+from squilla.optics import merit
 from squilla.optics.filters import FilterArray, MeasuredFilters, StencilRecipe, read_filters
 from squilla.optics.materials import refractive_index
 from squilla.spectra import grid
@@ -105,10 +105,12 @@ def test_angles_become_the_first_axis():
 
 
 def test_stack_shifts_to_the_blue_by_the_effective_index():
-    """A tilted array looks as the shift model with one n_eff near 1.75 says."""
+    """A tilted array looks as the shift model with one effective_index near 1.75 says."""
     array = StencilRecipe().draw(2)
     wavelength = grid(480, 800)
-    flat = MeasuredFilters(wavelength, array.transmittance(wavelength).numpy(), n_eff=1.75)
+    flat = MeasuredFilters(
+        wavelength, array.transmittance(wavelength).numpy(), effective_index=1.75
+    )
     true = array.transmittance(grid(), 0.15)
     unshifted = (array.transmittance(grid()) - true).abs().mean()
     assert (flat.transmittance(grid(), 0.15) - true).abs().mean() < 0.25 * unshifted
@@ -167,7 +169,7 @@ def test_every_kind_of_table_reads_alike(tmp_path):
 
 
 def test_shift_moves_a_peak_where_the_model_says():
-    table = replace(bell(600.0), n_eff=1.8)
+    table = replace(bell(600.0), effective_index=1.8)
     wavelength = grid(500, 700, 0.1)
     angle = np.array([0.0, 0.1, 0.3])
     peak = wavelength[table.transmittance(wavelength, angle)[:, 0].argmax(-1)]
@@ -177,7 +179,7 @@ def test_shift_moves_a_peak_where_the_model_says():
 
 
 def test_nothing_is_extrapolated_but_the_shift_at_the_edge():
-    table = replace(bell(790.0), n_eff=1.8)
+    table = replace(bell(790.0), effective_index=1.8)
     assert torch.isfinite(table.transmittance(grid(500, 800), 0.3)).all()
     with pytest.raises(InputError, match="400-800 nm"):
         table.transmittance(grid(500, 801))
@@ -204,56 +206,6 @@ def test_bad_files(tmp_path, name, content, message):
 def test_missing_file(tmp_path):
     with pytest.raises(InputError, match="no file"):
         read_filters(tmp_path / "none.csv")
-
-
-# --- figures of merit -------------------------------------------------------------------------
-
-
-def test_merit_of_perfect_filters():
-    """Ideal band-pass filters side by side: orthogonal, equally strong."""
-    response = torch.eye(5, dtype=torch.float64).repeat_interleave(4, -1)  # (5, 20)
-    assert optics.condition_number(response) == pytest.approx(1)
-    assert optics.singular_values(response).tolist() == pytest.approx([1] * 5)
-    assert optics.throughput(response) == pytest.approx(0.2)
-    assert optics.mutual_coherence(response[:, ::4]) == 0
-    assert optics.mutual_coherence(response) == pytest.approx(1)
-    # of rows that are 1 on a fifth of the band: cov = -1/25, var = 4/25
-    assert optics.mean_correlation(response) == pytest.approx(0.25)
-
-
-def test_correlation_agrees_with_numpy_and_ignores_scale_and_offset():
-    response = torch.rand(6, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    table = np.abs(np.corrcoef(response.numpy()))
-    assert optics.mean_correlation(response) == pytest.approx(table[~np.eye(6, dtype=bool)].mean())
-    assert optics.mean_correlation(3 * response + 1) == pytest.approx(
-        float(optics.mean_correlation(response))
-    )
-
-
-def test_peaks_of_a_fringe_are_counted():
-    wavelength = grid(500, 750)
-    fringe = 0.5 + 0.4 * np.sin(2 * np.pi * (wavelength - 500) / 50)  # maxima at 512.5, 562.5 ...
-    noise = 1e-3 * np.random.default_rng(0).standard_normal(251)
-    response = torch.from_numpy(np.stack([fringe, fringe + noise]))
-    assert optics.peak_density(response, wavelength) == pytest.approx(2.0)
-
-
-def test_random_arrays_resemble_the_published_kind():
-    """Mean transmittance near one half, filters weakly correlated, a peak or two per 100 nm."""
-    figures = []
-    for seed in range(12):
-        response = StencilRecipe().draw(seed).transmittance(grid())
-        figures.append(
-            [
-                float(optics.throughput(response)),
-                float(optics.mean_correlation(response)),
-                optics.peak_density(response, grid()),
-            ]
-        )
-    through, correlation, peaks = np.median(figures, 0)
-    assert 0.35 < through < 0.6
-    assert 0.2 < correlation < 0.45
-    assert 0.9 < peaks < 1.5
 
 
 # --- the command line -------------------------------------------------------------------------

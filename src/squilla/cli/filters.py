@@ -35,6 +35,7 @@ def analyse(
     """
     from squilla.errors import InputError
     from squilla.optics import filters as optics
+    from squilla.optics import merit
     from squilla.spectra import grid
 
     own = None
@@ -54,16 +55,16 @@ def analyse(
         raise InputError(f'There are no filters named {filters!r}; give "thesis" or a file.')
     band = array.wavelength if isinstance(array, optics.MeasuredFilters) else grid()
     response = array.transmittance(band)
-    values = optics.singular_values(response)
+    values = merit.singular_values(response)
     every = max(1, round(10 * (len(band) - 1) / (band[-1] - band[0])))
     figures = {
         "filters": len(response),
         "wavelength": [float(band[0]), float(band[-1]), len(band)],
-        "throughput": float(optics.throughput(response)),
-        "mean_correlation": float(optics.mean_correlation(response)),
-        "mutual_coherence": float(optics.mutual_coherence(response[:, ::every])),
-        "peak_density": optics.peak_density(response, band),
-        "condition_number": float(optics.condition_number(response)),
+        "throughput": float(merit.throughput(response)),
+        "mean_correlation": float(merit.mean_correlation(response)),
+        "mutual_coherence": float(merit.mutual_coherence(response[:, ::every])),
+        "peak_density": merit.peak_density(response, band),
+        "condition_number": float(merit.condition_number(response)),
         "singular_values": values.tolist(),
     }
     if as_json:

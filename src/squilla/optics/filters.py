@@ -1,4 +1,4 @@
-"""Filter arrays: the thesis' stencil process, a measured table, and how good either is."""
+"""Filter arrays: the thesis' stencil process, and tables that were measured."""
 
 import math
 import tomllib
@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from torch import Generator, Tensor
 
 from squilla.errors import InputError
+from squilla.optics.angle import blue_shift
 from squilla.optics.materials import read_columns, refractive_index
-from squilla.optics.thinfilm import transmittance
-from squilla.spectra import resample
+from squilla.optics.thinfilm import CACHED, Polarization, transmittance
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +24,9 @@ class FilterArray:
 
     material : names of the depositions' materials, L, from the glass outwards; see
         `refractive_index`.
-    thickness : (L,) of each deposition, nm.
-    layers : (M, L) bool, which layers each filter has.
+    thickness : (L,) of each deposition, nm; or (M, L) where each filter has its own.
+    layers : (M, L) bool, which layers each filter has. Further axes in front, here and in
+        `thickness`, make many arrays of it; the two are broadcast against each other.
     substrate : material of the glass plate, whose bare back face is counted, incoherently.
     scatter : factor on the transmittance for what roughness takes away, 0..1.
     """
@@ -37,8 +38,12 @@ class FilterArray:
     scatter: float = 1.0
 
     def __post_init__(self):
-        depositions = len(self.material)
-        if self.thickness.shape != (depositions,) or self.layers.shape[1:] != (depositions,):
+        depositions, given = len(self.material), (self.thickness.shape, self.layers.shape)
+        if (
+            self.layers.ndim < 2
+            or any(shape[-1:] != (depositions,) for shape in given)
+            or not _fit(self.thickness.shape, self.layers.shape)
+        ):
             raise InputError(
                 f"{depositions} materials need {depositions} thicknesses and a column of layers "
                 f"each; they are {tuple(self.thickness.shape)} and {tuple(self.layers.shape)}."
@@ -63,33 +68,54 @@ class FilterArray:
 
         Returns
         -------
-        Tensor, (M, K) for one angle, (A, M, K) for A angles, float64, 0..1
+        Tensor, (M, K) for one angle, (A, M, K) for A angles, float64, 0..1; many arrays (N, M, K)
+        and (N, A, M, K). Gradients flow to the thickness.
 
         Source: the incoherent back face, Macleod, Thin-Film Optical Filters, 5th ed., section 2.15;
         1/T = 1/T1 + 1/T2 - 1, exact where the film absorbs nothing.
         """
-        wavelength = np.asarray(wavelength, float)
+        wavelength, angle = np.asarray(wavelength, float), np.asarray(angle, float)
         table = {name: refractive_index(name, wavelength) for name in set(self.material)}
         index = np.stack([table[name] for name in reversed(self.material)])
         glass = refractive_index(self.substrate, wavelength)
-        total = torch.zeros(())
-        for polarization in ("s", "p"):
-            arguments: dict[str, Any] = {
-                "substrate": glass,
-                "angle": angle,
-                "polarization": polarization,
-            }
-            front = transmittance(index, self.stacks.flip(-1), wavelength, **arguments)
-            back = transmittance(index[:0], torch.zeros(0), wavelength, **arguments)
-            total = total + front * back / (front + back - front * back)
-        return (self.scatter / 2 * total).movedim(0, -2)
+        *many, filters, depositions = self.layers.shape
+        thickness = torch.atleast_2d(self.thickness)
+        thickness = thickness.expand(*many, *thickness.shape[-2:]).flip(-1)
+        few = max(1, CACHED // (filters * len(wavelength)))  # arrays at a time
+        parts = zip(
+            thickness.reshape(-1, thickness.shape[-2], depositions).split(few),
+            self.layers.flip(-1).reshape(-1, filters, depositions).split(few),
+            strict=True,
+        )
+        polarizations: tuple[Polarization, ...] = ("s", "p") if angle.any() else ("s",)
+        given: dict[str, Any] = {"substrate": glass, "angle": angle}
+        bare = [transmittance([], [], wavelength, polarization=p, **given) for p in polarizations]
+        plates = []
+        for thicknesses, layers in parts:
+            total = torch.zeros(())
+            for polarization, back in zip(polarizations, bare, strict=True):
+                front = transmittance(
+                    index,
+                    thicknesses,
+                    wavelength,
+                    layers=layers,
+                    polarization=polarization,
+                    **given,
+                )
+                total = total + front * back / (front + back - front * back)
+            plates.append(self.scatter / len(polarizations) * total)
+        plate = torch.cat(plates).reshape(*many, filters, *angle.shape, len(wavelength))
+        return plate.movedim(len(many), -2)
 
     def save(self, path: str | Path) -> None:
         """Write the array to a TOML file that `read_filters` reads."""
+        if self.layers.ndim != 2:
+            raise InputError(f"There are {len(self.layers)} arrays; save them one by one.")
         rows = ["".join("01"[int(layer)] for layer in row) for row in self.layers]
         lines = [
-            "# A filter array. Depositions count from the glass outwards, thickness in nm; each",
-            "# row of `layers` is a filter: 1 where it has the layer, 0 where it was left out.",
+            "# A filter array. Depositions count from the glass outwards, thickness in nm, a row for",
+            "# each filter where they differ; a row of `layers` is a filter: 1 where it has the",
+            "# layer, 0 where it was left out.",
             f"substrate = {dumps(self.substrate)}",
             f"scatter = {self.scatter!r}",
             f"material = {dumps(list(self.material))}",
@@ -173,12 +199,12 @@ class MeasuredFilters:
 
     wavelength : (K,) nm, increasing.
     values : (M, K) transmittance, 0..1, or a response in any unit.
-    n_eff : effective index of the stack, for its blue shift at an angle; None: no shift.
+    effective_index : effective index of the stack, for its blue shift at an angle; None: no shift.
     """
 
     wavelength: np.ndarray
     values: np.ndarray
-    n_eff: float | None = None
+    effective_index: float | None = None
 
     def __post_init__(self):
         if self.values.ndim != 2 or self.values.shape[1] != len(self.wavelength):
@@ -190,8 +216,10 @@ class MeasuredFilters:
             raise InputError("The filter table holds NaN or infinite values; repair the table.")
         if not np.all(np.diff(self.wavelength) > 0):
             raise InputError("The wavelengths of a filter table must increase.")
-        if self.n_eff is not None and not self.n_eff >= 1:
-            raise InputError(f"The effective index is {self.n_eff}; it must be 1 or more.")
+        if self.effective_index is not None and not self.effective_index >= 1:
+            raise InputError(
+                f"The effective index is {self.effective_index}; it must be 1 or more."
+            )
 
     def transmittance(self, wavelength: ArrayLike, angle: ArrayLike = 0.0) -> Tensor:
         """Return the table on another grid, shifted to the blue at an angle.
@@ -208,26 +236,36 @@ class MeasuredFilters:
         -------
         Tensor, (M, K) for one angle, (A, M, K) for A angles, float64
 
-        Source: Macleod, Thin-Film Optical Filters, 5th ed., the effective index of a tilted filter,
-        lambda' = lambda / sqrt(1 - (sin(angle) / n_eff)^2).
+        Source: `blue_shift`.
         """
-        wavelength, angle = np.asarray(wavelength, float), np.asarray(angle, float)
-        first, last = self.wavelength[[0, -1]]
-        if wavelength.min() < first - 1e-6 or wavelength.max() > last + 1e-6:
-            raise InputError(
-                f"The filter table covers {first:g}-{last:g} nm, but {wavelength.min():g}-"
-                f"{wavelength.max():g} nm is needed; nothing is extrapolated."
-            )
-        sine = np.sin(angle[..., None]) / (self.n_eff or np.inf)
-        seen = (wavelength / np.sqrt(1 - sine**2)).clip(first, last)
-        return torch.from_numpy(np.moveaxis(resample(self.values, self.wavelength, seen), 0, -2))
+        shifts = np.stack(
+            [
+                blue_shift(
+                    self.wavelength,
+                    ([one], [1.0]),
+                    self.effective_index or np.inf,
+                    onto=np.asarray(wavelength, float),
+                )
+                for one in np.atleast_1d(np.asarray(angle, float))
+            ]
+        )
+        seen = self.values @ shifts.swapaxes(-1, -2)
+        return torch.from_numpy(seen if np.ndim(angle) else seen[0])
+
+
+def _fit(shape: tuple[int, ...], layers: tuple[int, ...]) -> bool:
+    """Whether thicknesses of a shape broadcast to the layers'."""
+    padded = (1,) * (len(layers) - len(shape)) + tuple(shape)
+    return len(padded) == len(layers) and all(
+        a in (1, b) for a, b in zip(padded, layers, strict=True)
+    )
 
 
 # --- files ----------------------------------------------------------------------------------
 
 
 def read_filters(
-    path: str | Path, *, wavelength: ArrayLike | None = None, n_eff: float | None = None
+    path: str | Path, *, wavelength: ArrayLike | None = None, effective_index: float | None = None
 ) -> FilterArray | MeasuredFilters:
     """Read a filter array: a design in TOML, or a measured table of any common kind.
 
@@ -241,7 +279,7 @@ def read_filters(
     wavelength : (K,), optional
         nm; needed where the file holds none: for ``.npy`` always, for ``.npz`` and ``.mat`` unless
         a variable is named ``wavelength``, ``wavelengths`` or ``lambda``.
-    n_eff : float, optional
+    effective_index : float, optional
         Effective index for the shift of a measured table at an angle; None: no shift.
 
     Raises
@@ -273,7 +311,7 @@ def read_filters(
     if values.ndim == 2 and values.shape[1] != len(wavelength) == values.shape[0]:
         values = values.T
     order = np.argsort(wavelength) if values.shape[-1] == len(wavelength) else slice(None)
-    return MeasuredFilters(wavelength[order], values[..., order], n_eff)
+    return MeasuredFilters(wavelength[order], values[..., order], effective_index)
 
 
 def _read_design(path: Path) -> FilterArray:
@@ -362,55 +400,3 @@ _TABLES = {
     ".mat": _read_mat,
     ".nc": _read_netcdf,
 }
-
-
-# --- how good a filter array is -------------------------------------------------------------
-
-
-def mean_correlation(response: Tensor) -> Tensor:
-    """Return the mean absolute correlation of different rows of a response matrix, (M, K), 0..1."""
-    rows = len(response)
-    correlation = torch.corrcoef(response).abs()
-    return (correlation.sum() - rows) / (rows * (rows - 1))
-
-
-def mutual_coherence(response: Tensor) -> Tensor:
-    """Return the largest cosine between different columns of a response matrix, (M, K), 0..1.
-
-    At 0 the columns are orthogonal, at 1 two of them cannot be told apart, as is nearly so for
-    bands 1 nm apart: thin the bands, or multiply by a dictionary, (K, N), first.
-
-    Source: Donoho and Elad, PNAS 100, 2197 (2003).
-    """
-    column = torch.nn.functional.normalize(response, dim=0)
-    return (column.T @ column).abs().fill_diagonal_(0).max()
-
-
-def singular_values(response: Tensor) -> Tensor:
-    """Return the singular values of a response matrix, (M, K), relative to the largest, (M,)."""
-    values = torch.linalg.svdvals(response)
-    return values / values[0]
-
-
-def condition_number(response: Tensor) -> Tensor:
-    """Return the ratio of the largest to the smallest singular value of a matrix, (M, K)."""
-    return 1 / singular_values(response)[-1]
-
-
-def throughput(response: Tensor) -> Tensor:
-    """Return the mean of a response matrix, (M, K): the share of white light that arrives."""
-    return response.mean()
-
-
-def peak_density(response: Tensor, wavelength: ArrayLike) -> float:
-    """Return the number of maxima per 100 nm, averaged over the rows of a response, (M, K).
-
-    A maximum counts if it stands out by 5 % of the largest value, more than the noise of a measured
-    table does; those at the ends of the band do not count.
-    """
-    from scipy.signal import find_peaks
-
-    wavelength = np.asarray(wavelength, float)
-    rows = response.detach().cpu().numpy()
-    peaks = sum(len(find_peaks(row, prominence=0.05 * rows.max())[0]) for row in rows)
-    return float(100 * peaks / len(rows) / (wavelength[-1] - wavelength[0]))
