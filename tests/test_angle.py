@@ -45,8 +45,9 @@ def difference(response, truth):
 
 
 @pytest.mark.parametrize(
-    ("where", "least", "left"), [("centre", 0.01, 0.004), ("edge", 0.04, 0.008), ("corner", 0.06, 0.013)]
-)  # fmt: skip
+    ("where", "least", "left"),
+    [("centre", 0.01, 0.004), ("edge", 0.04, 0.008), ("corner", 0.06, 0.013)],
+)
 def test_the_shift_explains_what_a_stack_does_in_a_cone(array, exact, where, least, left):
     collimated = array.transmittance(WIDE).numpy()
     cones = [pupil(chief) for chief in FIELD.values()]
@@ -100,7 +101,7 @@ def test_a_table_of_filters_shifts_by_the_same_matrix():
 
 def test_bad_input():
     response = np.ones((3, len(WIDE)))
-    with pytest.raises(InputError, match="effective index is 0.9"):
+    with pytest.raises(InputError, match="effective index"):
         blue_shift(WIDE, ([0.1], [1.0]), 0.9)
     with pytest.raises(InputError, match="480-780 nm"):
         blue_shift(WIDE, ([0.1], [1.0]), 1.7, onto=[470.0])

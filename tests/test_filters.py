@@ -10,7 +10,6 @@ from typer.testing import CliRunner
 
 from squilla.cli.filters import app
 from squilla.errors import InputError
-from squilla.optics import merit
 from squilla.optics.filters import FilterArray, MeasuredFilters, StencilRecipe, read_filters
 from squilla.optics.materials import refractive_index
 from squilla.spectra import grid

@@ -12,6 +12,7 @@ Source: Macleod, Thin-Film Optical Filters, 5th ed., the effective index of a ti
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -143,4 +144,5 @@ def fit_effective_index(
             for cone, seen in zip(cones, tilted, strict=True)
         )
 
-    return float(minimize_scalar(misfit, bounds=(1, 4), options={"xatol": 1e-4}).x)
+    found: Any = minimize_scalar(misfit, bounds=(1, 4), options={"xatol": 1e-4})
+    return float(found.x)

@@ -9,7 +9,7 @@ the mean over bands and spectra. It is in closed form, has a gradient, and takes
 as strong in every channel, or that of photons, of which a narrow filter passes few.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -107,7 +107,7 @@ class PhotonNoise:
 
     exposure: float
     read_noise: float = 2.5
-    clear: Tensor | float = 1.0
+    clear: Tensor | float = field(default=1.0, repr=False)
 
     def __post_init__(self):
         if not (self.exposure > 0 and self.read_noise >= 0):
