@@ -203,22 +203,27 @@ def refine(
     """Return the array at the nearest minimum over its thicknesses, and its merit."""
     from scipy.optimize import minimize
 
-    shape = array.thickness.shape
-    least, most = (limit.expand(shape).numpy().ravel() for limit in recipe.limits)
-    scale = float(merit(array.transmittance(wavelength)))
+    least, most = (limit.expand(array.thickness.shape) for limit in recipe.limits)
 
-    def slope(thickness: np.ndarray) -> tuple[float, np.ndarray]:
-        layers = torch.from_numpy(thickness).reshape(shape).requires_grad_()
-        value = merit(replace(array, thickness=layers).transmittance(wavelength)) / scale
-        (gradient,) = torch.autograd.grad(value, layers)
+    def slope(place: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the merit and its gradient, both over `scale`; places are 0..1 within limits."""
+        within = torch.from_numpy(place).reshape(least.shape).requires_grad_()
+        made = replace(array, thickness=least + (most - least) * within)
+        value = merit(made.transmittance(wavelength)) / scale
+        (gradient,) = torch.autograd.grad(value, within)
         return value.item(), gradient.numpy().ravel()
 
+    start = ((array.thickness - least) / (most - least)).numpy().ravel()
+    scale = 1.0
+    # Where all variables have bounds, L-BFGS-B first steps as far as the gradient is long.
+    scale = max(10 * float(np.linalg.norm(slope(start)[1])), 1e-300)
     found = minimize(
         slope,
-        array.thickness.numpy().ravel(),
+        start,
         jac=True,
         method="L-BFGS-B",
-        bounds=list(zip(least, most, strict=True)),
-        options={"maxiter": steps, "maxcor": 20, "ftol": 1e-6, "gtol": 1e-7},
+        bounds=[(0, 1)] * len(start),
+        options={"maxiter": steps, "maxcor": 20, "ftol": 1e-7, "gtol": 1e-7},
     )
-    return replace(array, thickness=torch.from_numpy(found.x).reshape(shape)), scale * found.fun
+    thickness = least + (most - least) * torch.from_numpy(found.x).reshape(least.shape)
+    return replace(array, thickness=thickness), scale * float(found.fun)

@@ -31,7 +31,7 @@ from squilla.errors import InputError
 
 Polarization = Literal["s", "p", "unpolarized"]
 
-CACHED = 36_000
+CACHED = 100_000
 """Complex numbers of one wave that are worked on at a time: what stays in a processor's cache."""
 
 
