@@ -1,4 +1,4 @@
-"""What better filters gain: drawn at random, optimised, ideal; judged, confirmed, coated with faults.
+"""What better filters gain: drawn, optimised, ideal; judged, confirmed, coated with faults.
 
 Usage: python experiments/filter_design.py [results folder]
 
@@ -32,7 +32,6 @@ from squilla.optics.merit import (
     PhotonNoise,
     Prior,
     WhiteNoise,
-    estimator_error,
     expected_error,
     wiener,
 )
@@ -156,7 +155,7 @@ def compare(folder: Path) -> dict:
 def reconstruct(
     spectra: torch.Tensor, sensitivity: torch.Tensor, estimator: torch.Tensor, noise: Noise
 ) -> float:
-    """Measure spectra with noise drawn as the physics has it, reconstruct them, return the error."""
+    """Measure spectra, noise drawn as the physics has it, reconstruct them, return the error."""
     generator = torch.Generator().manual_seed(SEED + 2)
     y = spectra @ sensitivity.T
     unit = torch.randn(y.shape, generator=generator, dtype=torch.float64)

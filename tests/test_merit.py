@@ -111,6 +111,21 @@ def test_the_wiener_matrix_is_the_best_and_reaches_the_bound():
     )
 
 
+@pytest.mark.parametrize("noise", [WhiteNoise(25), PhotonNoise(300.0)])
+def test_monte_carlo_with_the_estimator_of_another_array(noise):
+    generator = torch.Generator().manual_seed(4)
+    true, believed, count = response(7), response(8), 20_000
+    spectra = torch.randn(count, len(BAND), dtype=torch.float64, generator=generator)
+    spectra = spectra @ moment_root(NATURAL).T
+    deviation = noise.variance(true, NATURAL).sqrt()
+    y = spectra @ true.T
+    y = y + deviation * torch.randn(y.shape, dtype=torch.float64, generator=generator)
+    estimator = wiener(believed, NATURAL, noise=noise)
+    each = (y @ estimator.mT - spectra).square().mean(-1)
+    error = estimator_error(estimator, true, NATURAL, noise=noise).item()
+    assert each.mean() == pytest.approx(error, abs=4 * (each.std() / count**0.5).item())
+
+
 def test_many_arrays_at_once():
     sensitivity = torch.stack([response(seed) for seed in range(6)]).reshape(2, 3, 12, -1)
     for noise in (WhiteNoise(25), PhotonNoise(200.0)):

@@ -348,6 +348,9 @@ def linear_variable_filter(
 ) -> FilterArray:
     """Return filters cut out of a wedge: one cavity, all layers of which grow along the band.
 
+    It leaks where its mirrors reflect no more, some 80 nm off each peak: a product would block that
+    with further filters.
+
     Parameters
     ----------
     filters : int
