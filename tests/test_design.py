@@ -102,6 +102,13 @@ def test_exchanged_masks_are_those_that_brute_force_finds():
             assert error(replace(array, layers=layers).transmittance(BAND)) >= value - 1e-12
 
 
+def test_where_every_mask_is_taken_there_is_nothing_to_exchange():
+    recipe = StencilRecipe(filters=4, depositions=4, omitted=(1, 1))
+    start = recipe.draw(0)
+    array = exchange(recipe, start, error, BAND, torch.Generator())
+    assert torch.equal(array.layers, start.layers)
+
+
 @pytest.mark.parametrize("noise", [WhiteNoise(25), PhotonNoise(500.0)])
 @pytest.mark.parametrize(
     "recipe", [FreeRecipe(filters=4, depositions=5), FabryPerotRecipe(filters=6, order=(1, 1))]
@@ -160,6 +167,8 @@ def test_design_from_the_command_line(tmp_path):
     [
         (["--recipe", "glass", "-o", "a.toml"], "no recipe"),
         (["-o", "a.csv"], "toml"),
+        (["-o", "nowhere/a.toml"], "folder that exists"),
+        (["-o", "a.toml", "--plot", "a.xls"], "cannot be drawn"),
         (["-o", "a.toml", "--snr", "20", "--exposure", "100"], "not both"),
         (["-o", "a.toml", "--prior", "nature"], "no prior"),
         (["-o", "a.toml", "--camera", "nobodys"], "no camera design"),

@@ -152,8 +152,12 @@ def design(
     kinds = {"stencil": StencilRecipe, "free": FreeRecipe, "fabry-perot": FabryPerotRecipe}
     if recipe not in kinds:
         raise InputError(f"There is no recipe {recipe!r}; there are {', '.join(kinds)}.")
-    if output.suffix.lower() != ".toml":
-        raise InputError(f"An array is written to a .toml file, not to {output.name}.")
+    if output.suffix.lower() != ".toml" or not output.parent.is_dir():
+        raise InputError(f"{output} cannot be written: give a .toml file in a folder that exists.")
+    if plot is not None and not (plot.suffix in (".png", ".pdf", ".svg") and plot.parent.is_dir()):
+        raise InputError(
+            f"{plot} cannot be drawn: give a .png, .pdf or .svg in a folder that exists."
+        )
     paper = CameraDesign.load(camera)
     known, noise, efficiency = _figure_of_merit(paper, prior, snr, exposure)
     band = known.wavelength
@@ -221,7 +225,7 @@ def tolerance(
     exposure: ExposureOption = None,
     prior: PriorOption = "natural",
     camera: CameraOption = "thesis",
-    count: Annotated[int, typer.Option(help="How often the array is coated.")] = 1000,
+    count: Annotated[int, typer.Option(min=1, help="How often the array is coated.")] = 1000,
     seed: Annotated[int, typer.Option(help="Of the random faults.")] = 0,
     as_json: JsonOption = False,
 ) -> None:

@@ -77,9 +77,11 @@ def blue_shift(
     )
     stretch, each = np.unique(np.sqrt(here / there), return_inverse=True)
     weight = np.bincount(each, np.broadcast_to(np.asarray(cone[1], float), each.shape))
-    seen = np.clip(stretch[:, None] * onto, first, last)
-    read = resample(np.eye(len(wavelength)), wavelength, seen.ravel())
-    return np.einsum("kpo,p->ok", read.reshape(len(wavelength), *seen.shape), weight)
+    one_each = np.eye(len(wavelength))
+    matrix = np.zeros((len(wavelength), len(onto)))
+    for stretched, share in zip(stretch[:, None] * onto, weight, strict=True):
+        matrix += share * resample(one_each, wavelength, np.clip(stretched, first, last))
+    return matrix.T
 
 
 def fit_effective_index(

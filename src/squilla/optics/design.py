@@ -16,6 +16,12 @@ from torch import Generator, Tensor
 from squilla.errors import InputError
 from squilla.optics.filters import FilterArray
 
+BATCH = 64
+"""Arrays whose merit is taken at once."""
+
+CANDIDATES = 256
+"""Other masks among which each exchange takes the best."""
+
 Merit = Callable[[Tensor], Tensor]
 """From transmittances (..., M, K) to what shall be least, (...), with a gradient."""
 
@@ -150,13 +156,6 @@ def optimise(
     return Search(array, value, arrays[chosen[0]], drawn, history)
 
 
-BATCH = 64
-"""Arrays whose merit is taken at once."""
-
-CANDIDATES = 256
-"""Other masks among which each exchange takes the best."""
-
-
 def together(arrays: list[FilterArray]) -> FilterArray:
     """Return arrays of the same materials as one, (N, M, L)."""
     thickness = torch.stack([torch.atleast_2d(array.thickness) for array in arrays])
@@ -184,6 +183,8 @@ def exchange(
             return array
         fresh = (masks[:, None] != layers).any(-1).all(-1)  # no other filter is made so
         masks = masks[fresh]
+        if not len(masks):
+            break
         which = torch.randint(filters, (len(masks),), generator=generator)
         tried = response.repeat(len(masks), 1, 1)
         tried[torch.arange(len(masks)), which] = replace(array, layers=masks).transmittance(
@@ -216,7 +217,7 @@ def refine(
     start = ((array.thickness - least) / (most - least)).numpy().ravel()
     scale = 1.0
     # Where all variables have bounds, L-BFGS-B first steps as far as the gradient is long.
-    scale = max(10 * float(np.linalg.norm(slope(start)[1])), 1e-300)
+    scale = 10 * float(np.linalg.norm(slope(start)[1])) or 1.0
     found = minimize(
         slope,
         start,

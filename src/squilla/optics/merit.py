@@ -146,7 +146,7 @@ def expected_error(sensitivity: Tensor, prior: Prior, *, noise: Noise) -> Tensor
 
     Source: the module's.
     """
-    _, signal, covariance = _moments(sensitivity, prior, noise)
+    signal, covariance = _moments(sensitivity, prior, noise)
     # The trace of S R' G^-1 R S is the squared norm of L^-1 R S with G = L L'.
     explained = torch.linalg.solve_triangular(
         torch.linalg.cholesky(covariance), signal, upper=False
@@ -160,7 +160,7 @@ def wiener(sensitivity: Tensor, prior: Prior, *, noise: Noise) -> Tensor:
 
     Parameters, errors and source are those of `expected_error`.
     """
-    _, signal, covariance = _moments(sensitivity, prior, noise)
+    signal, covariance = _moments(sensitivity, prior, noise)
     return torch.cholesky_solve(signal, torch.linalg.cholesky(covariance)).mT
 
 
@@ -182,14 +182,14 @@ def estimator_error(
     -------
     Tensor, (...), float64; the bias, (I - W R) x, and the noise that passes W, both squared
     """
-    _, signal, covariance = _moments(sensitivity, prior, noise)
+    signal, covariance = _moments(sensitivity, prior, noise)
     together = (estimator.mT * signal).sum((-2, -1))
     spread = (covariance * (estimator.mT @ estimator)).sum((-2, -1))
     return (prior.moment.trace() - 2 * together + spread) / len(prior.wavelength)
 
 
-def _moments(sensitivity: Tensor, prior: Prior, noise: Noise) -> tuple[Tensor, Tensor, Tensor]:
-    """Return R, R S and the second moment of the measurements, R S R' + N."""
+def _moments(sensitivity: Tensor, prior: Prior, noise: Noise) -> tuple[Tensor, Tensor]:
+    """Return R S and the second moment of the measurements, R S R' + N."""
     sensitivity = torch.as_tensor(sensitivity, dtype=torch.float64)
     bands = len(prior.wavelength)
     if sensitivity.ndim < 2 or sensitivity.shape[-1] != bands:
@@ -199,7 +199,7 @@ def _moments(sensitivity: Tensor, prior: Prior, noise: Noise) -> tuple[Tensor, T
         )
     signal = sensitivity @ prior.moment
     variance = noise.variance(sensitivity, prior)
-    return sensitivity, signal, signal @ sensitivity.mT + torch.diag_embed(variance)
+    return signal, signal @ sensitivity.mT + torch.diag_embed(variance)
 
 
 # --- simpler figures ----------------------------------------------------------------------------
