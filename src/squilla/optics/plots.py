@@ -33,20 +33,17 @@ def plot_search(search: Search, wavelength: ArrayLike, title: str = "") -> "Figu
     drawn, first = search.drawn.numpy(), float(search.drawn.min())
 
     axes["drawn"].hist(drawn, 40, color="0.7")
-    lines = {
-        f"median {np.median(drawn):.4f}": (float(np.median(drawn)), "0.4"),
-        f"best drawn {first:.4f}": (first, "tab:orange"),
-        f"optimised {search.merit:.4f}": (search.merit, "tab:blue"),
-    }
-    for label, (value, colour) in lines.items():
-        axes["drawn"].axvline(value, color=colour, label=label)
+    marks = {"median drawn": "0.4", "best drawn": "tab:orange", "optimised": "tab:blue"}
+    for value, colour in zip((np.median(drawn), first, search.merit), marks.values(), strict=True):
+        axes["drawn"].axvline(float(value), color=colour)
     axes["drawn"].set(xlim=(0, None), xlabel="expected error", ylabel="arrays drawn")
-    axes["drawn"].legend(loc="upper right")
 
     improved = [first, *(step.merit for step in search.history[len(drawn) :])]
-    axes["way"].plot(improved, ".-", color="tab:blue")
-    axes["way"].axhline(float(np.median(drawn)), color="0.4")
-    axes["way"].axhline(first, color="tab:orange")
+    median = float(np.median(drawn))
+    axes["way"].axhline(median, color="0.4", label=f"median drawn {median:.4f}")
+    axes["way"].axhline(first, color="tab:orange", label=f"best drawn {first:.4f}")
+    axes["way"].plot(improved, ".-", color="tab:blue", label=f"optimised {search.merit:.4f}")
+    axes["way"].legend(loc="lower right")
     axes["way"].set(ylim=(0, None), xlabel="rounds of improvement", ylabel="best so far")
 
     for name, array, label in (
@@ -101,6 +98,6 @@ def plot_tolerance(
         panel.axhline(1.1, color="0.7", linestyle=":")
         panel.set(title=name, xlabel="standard deviation, %", xlim=(0, percent[-1]))
     axes[0].set(ylabel="error against the design's", ylim=(0.8, 3))
-    axes[0].legend(loc="upper left")
+    axes[-1].legend(loc="upper left")
     figure.suptitle(title)
     return figure
