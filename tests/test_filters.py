@@ -8,11 +8,20 @@ import torch
 from tmm import coh_tmm
 from typer.testing import CliRunner
 
+from squilla.camera.design import CameraDesign
 from squilla.cli.filters import app
 from squilla.errors import InputError
-from squilla.optics import filters as optics
-from squilla.optics.filters import FilterArray, MeasuredFilters, StencilRecipe, read_filters
+from squilla.optics.filters import (
+    FabryPerotRecipe,
+    FilterArray,
+    FreeRecipe,
+    MeasuredFilters,
+    StencilRecipe,
+    linear_variable_filter,
+    read_filters,
+)
 from squilla.optics.materials import refractive_index
+from squilla.optics.tables import band_pass
 from squilla.spectra import grid
 
 IMEC = package_files("squilla") / "data" / "responses" / "spectral_responses_5x5.mat"
@@ -105,21 +114,118 @@ def test_angles_become_the_first_axis():
 
 
 def test_stack_shifts_to_the_blue_by_the_effective_index():
-    """A tilted array looks as the shift model with one n_eff near 1.75 says."""
+    """A tilted array looks as the shift model with one effective_index near 1.75 says."""
     array = StencilRecipe().draw(2)
     wavelength = grid(480, 800)
-    flat = MeasuredFilters(wavelength, array.transmittance(wavelength).numpy(), n_eff=1.75)
+    flat = MeasuredFilters(
+        wavelength, array.transmittance(wavelength).numpy(), effective_index=1.75
+    )
     true = array.transmittance(grid(), 0.15)
     unshifted = (array.transmittance(grid()) - true).abs().mean()
     assert (flat.transmittance(grid(), 0.15) - true).abs().mean() < 0.25 * unshifted
 
 
-def test_array_survives_its_file(tmp_path):
-    array = StencilRecipe().draw(6)
+@pytest.mark.parametrize("recipe", [StencilRecipe(), FreeRecipe(), FabryPerotRecipe()])
+def test_array_survives_its_file(tmp_path, recipe):
+    array = recipe.draw(6)
     array.save(tmp_path / "array.toml")
     again = read_filters(tmp_path / "array.toml")
     assert isinstance(again, FilterArray)
     assert torch.equal(again.transmittance(grid()), array.transmittance(grid()))
+
+
+# --- other recipes ----------------------------------------------------------------------------
+
+
+def test_free_filters_have_stacks_of_their_own_within_the_limits():
+    recipe = FreeRecipe(filters=50)
+    array = recipe.draw(1)
+    least, most = recipe.limits
+    assert array.thickness.shape == (50, 19)
+    assert ((array.thickness >= least) & (array.thickness <= most)).all()
+    assert array.layers.all()
+    alone = [
+        FilterArray(array.material, row, array.layers[:1], array.substrate, array.scatter)
+        for row in array.thickness[:3]
+    ]
+    together = array.transmittance(grid())[:3]
+    for one, response in zip(alone, together, strict=True):
+        torch.testing.assert_close(one.transmittance(grid())[0], response)
+
+
+def test_spacers_of_cavities_step_evenly():
+    recipe = FabryPerotRecipe(filters=11, mirror=5)
+    for seed in range(5):
+        array = recipe.draw(seed)
+        spacer = array.stacks[:, 5:-5].sum(-1)
+        steps = spacer.diff()
+        torch.testing.assert_close(steps, steps[:1].expand_as(steps))
+        n = refractive_index(recipe.low, 600.0).real[0]
+        order = 2 * n * spacer[0] / 500
+        assert order.item() == pytest.approx(round(order.item()), abs=0.01)
+        assert array.layers[:, :5].all()
+        assert array.layers[:, -5:].all()
+
+
+def test_a_cavity_transmits_where_its_closed_form_says():
+    """Between two mirrors of amplitude reflectance r, the phase of the round trip sets the peak."""
+    recipe = FabryPerotRecipe(filters=8, order=(1, 1), centre=(610, 610), mirror=5, scatter=1.0)
+    array = recipe.draw(0)
+    wavelength = grid(560, 670, 0.25)
+    response = array.transmittance(wavelength).numpy()
+    first, last = slice(0, 5), slice(4, None, -1)  # the first mirror, seen from the glass and back
+    found = 0
+    for row, spacer in zip(response, array.stacks[:, 5:-5].sum(-1).tolist(), strict=True):
+        phase = []
+        for lam in wavelength:
+            index = [refractive_index(m, lam)[0].real for m in array.material[:5]]
+            within = refractive_index(recipe.low, lam)[0].real
+            glass = refractive_index(array.substrate, lam)[0].real
+            mirrors = [
+                coh_tmm(
+                    "s", [within, *index[part], behind],
+                    [np.inf, *array.thickness[:5].tolist()[part], np.inf], 0, lam,
+                )["r"]
+                for part, behind in ((first, 1.0), (last, glass))
+            ]  # fmt: skip
+            round_trip = np.exp(4j * np.pi * within * spacer / lam)
+            phase.append(np.angle(mirrors[0] * mirrors[1] * round_trip))
+        crossing = (np.diff(np.sign(phase)) < 0) & (np.abs(phase[1:]) < 1)
+        for peak in wavelength[1:][crossing]:
+            near = np.abs(wavelength - peak) < 8
+            assert wavelength[near][row[near].argmax()] == pytest.approx(peak, abs=1.0)
+            found += 1
+    assert found >= 4
+
+
+def test_a_wedge_transmits_where_it_was_cut():
+    peaks = np.linspace(560, 680, 11)
+    for response, peak in zip(
+        linear_variable_filter(11, (560, 680), mirror=7).transmittance(grid()), peaks, strict=True
+    ):
+        near = np.abs(grid() - peak) < 30  # further off, the mirrors reflect no more
+        assert grid()[near][response[near].argmax()] == pytest.approx(peak, abs=4)
+        assert response[near].max() > 30 * response[near][[0, -1]].max()
+
+
+def test_ideal_band_pass_filters():
+    table = band_pass(25, grid(), fwhm=20.0, peak=0.8)
+    assert table.values.max() == pytest.approx(0.8, rel=1e-3)
+    peak = grid()[table.values.argmax(-1)]
+    np.testing.assert_allclose(peak, np.arange(505, 750, 10), atol=0.5)
+    assert np.sum(table.values[12] > 0.4) in (19, 20, 21)
+
+
+def test_impossible_cavities_are_refused():
+    with pytest.raises(InputError, match="odd number"):
+        FabryPerotRecipe(mirror=4)
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    array = StencilRecipe(filters=5).draw(0)
+    for thickness in (array.thickness[:-1], torch.ones(4, 19), torch.ones(2, 5, 19)):
+        with pytest.raises(InputError, match="19 thicknesses"):
+            replace(array, thickness=thickness)
 
 
 # --- measured tables --------------------------------------------------------------------------
@@ -167,7 +273,7 @@ def test_every_kind_of_table_reads_alike(tmp_path):
 
 
 def test_shift_moves_a_peak_where_the_model_says():
-    table = replace(bell(600.0), n_eff=1.8)
+    table = replace(bell(600.0), effective_index=1.8)
     wavelength = grid(500, 700, 0.1)
     angle = np.array([0.0, 0.1, 0.3])
     peak = wavelength[table.transmittance(wavelength, angle)[:, 0].argmax(-1)]
@@ -177,7 +283,7 @@ def test_shift_moves_a_peak_where_the_model_says():
 
 
 def test_nothing_is_extrapolated_but_the_shift_at_the_edge():
-    table = replace(bell(790.0), n_eff=1.8)
+    table = replace(bell(790.0), effective_index=1.8)
     assert torch.isfinite(table.transmittance(grid(500, 800), 0.3)).all()
     with pytest.raises(InputError, match="400-800 nm"):
         table.transmittance(grid(500, 801))
@@ -206,56 +312,6 @@ def test_missing_file(tmp_path):
         read_filters(tmp_path / "none.csv")
 
 
-# --- figures of merit -------------------------------------------------------------------------
-
-
-def test_merit_of_perfect_filters():
-    """Ideal band-pass filters side by side: orthogonal, equally strong."""
-    response = torch.eye(5, dtype=torch.float64).repeat_interleave(4, -1)  # (5, 20)
-    assert optics.condition_number(response) == pytest.approx(1)
-    assert optics.singular_values(response).tolist() == pytest.approx([1] * 5)
-    assert optics.throughput(response) == pytest.approx(0.2)
-    assert optics.mutual_coherence(response[:, ::4]) == 0
-    assert optics.mutual_coherence(response) == pytest.approx(1)
-    # of rows that are 1 on a fifth of the band: cov = -1/25, var = 4/25
-    assert optics.mean_correlation(response) == pytest.approx(0.25)
-
-
-def test_correlation_agrees_with_numpy_and_ignores_scale_and_offset():
-    response = torch.rand(6, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    table = np.abs(np.corrcoef(response.numpy()))
-    assert optics.mean_correlation(response) == pytest.approx(table[~np.eye(6, dtype=bool)].mean())
-    assert optics.mean_correlation(3 * response + 1) == pytest.approx(
-        float(optics.mean_correlation(response))
-    )
-
-
-def test_peaks_of_a_fringe_are_counted():
-    wavelength = grid(500, 750)
-    fringe = 0.5 + 0.4 * np.sin(2 * np.pi * (wavelength - 500) / 50)  # maxima at 512.5, 562.5 ...
-    noise = 1e-3 * np.random.default_rng(0).standard_normal(251)
-    response = torch.from_numpy(np.stack([fringe, fringe + noise]))
-    assert optics.peak_density(response, wavelength) == pytest.approx(2.0)
-
-
-def test_random_arrays_resemble_the_published_kind():
-    """Mean transmittance near one half, filters weakly correlated, a peak or two per 100 nm."""
-    figures = []
-    for seed in range(12):
-        response = StencilRecipe().draw(seed).transmittance(grid())
-        figures.append(
-            [
-                float(optics.throughput(response)),
-                float(optics.mean_correlation(response)),
-                optics.peak_density(response, grid()),
-            ]
-        )
-    through, correlation, peaks = np.median(figures, 0)
-    assert 0.35 < through < 0.6
-    assert 0.2 < correlation < 0.45
-    assert 0.9 < peaks < 1.5
-
-
 # --- the command line -------------------------------------------------------------------------
 
 
@@ -268,6 +324,15 @@ def test_analyse_thesis():
     assert len(figures["singular_values"]) == 36
     text = CliRunner().invoke(app, ["analyse", "thesis", "--seed", "3"])
     assert f"{figures['throughput']:.3f}" in text.output
+    error = figures["expected_error"]
+    assert error["20 dB"] > error["30 dB"] > error["40 dB"] > 0
+
+
+def test_analyse_takes_the_seed_of_the_camera():
+    result = CliRunner().invoke(app, ["analyse", "thesis", "--json"])
+    camera = CameraDesign.load("thesis")
+    response = StencilRecipe().draw(camera.filters.seed).transmittance(grid())
+    assert json.loads(result.output)["throughput"] == pytest.approx(response.mean().item())
 
 
 def test_analyse_table():

@@ -111,7 +111,20 @@ def test_layers_without_thickness_change_nothing_at_all():
     given = {"substrate": substrate, "angle": [0.0, 0.6]}
     with_them = transmittance(index, thickness, WAVELENGTH, **given)
     without = transmittance(index[keep], thickness[:, keep], WAVELENGTH, **given)
-    assert torch.equal(with_them, without)
+    torch.testing.assert_close(with_them, without, rtol=0, atol=1e-14)
+
+
+def test_layers_that_a_stack_lacks():
+    """Stacks that share thicknesses and lack layers are those built one by one."""
+    index, thickness, substrate = random_stack(11)
+    layers = np.random.default_rng(0).random((5, 1, 7)) < 0.6
+    given = {"substrate": substrate, "angle": [0.0, 0.6]}
+    for function in (transmittance, reflectance):
+        shared = function(index, thickness, WAVELENGTH, layers=layers, **given)
+        assert shared.shape == (5, 3, 2, len(WAVELENGTH))
+        for m, row in enumerate(layers[:, 0]):
+            alone = function(index[row], thickness[:, row], WAVELENGTH, **given)
+            torch.testing.assert_close(shared[m], alone, rtol=0, atol=1e-13)
 
 
 def test_opaque_metal_neither_overflows_nor_transmits():
@@ -189,6 +202,7 @@ def test_gradient_of_a_layer_that_is_just_being_born():
         ({"polarization": "TE"}, "TE"),
         ({"ambient": 1 + 0.1j}, "real and positive"),
         ({"wavelength": [0.0, 500.0]}, "positive"),
+        ({"layers": [True, False, True]}, "said for 3"),
     ],
 )
 def test_bad_input(change, message):

@@ -11,6 +11,13 @@ COLOURS = 18
 """The thesis averages over the first 18 patches: the colours without the row of greys."""
 
 
+def inner(labels: np.ndarray, margin: int = 3) -> np.ndarray:
+    """Return labels, (H, W), with -1 also for pixels within `margin` px of a patch's border."""
+    window = 2 * margin + 1
+    alike = minimum_filter(labels, window) == maximum_filter(labels, window)
+    return np.where(alike, labels, -1)
+
+
 def patch_means(cube: ArrayLike, labels: np.ndarray, margin: int = 3) -> np.ndarray:
     """Return the mean spectrum of each patch.
 
@@ -34,11 +41,10 @@ def patch_means(cube: ArrayLike, labels: np.ndarray, margin: int = 3) -> np.ndar
     cube, labels = np.asarray(cube), np.asarray(labels)
     if cube.shape[:2] != labels.shape:
         raise InputError(f"The cube is {cube.shape[:2]} px, but its labels are {labels.shape}.")
-    window = 2 * margin + 1
-    inner = minimum_filter(labels, window) == maximum_filter(labels, window)
+    labels = inner(labels, margin)
     means = []
     for patch in range(labels.max() + 1):
-        chosen = inner & (labels == patch)
+        chosen = labels == patch
         if not chosen.any():
             raise InputError(f"A margin of {margin} px leaves nothing of patch {patch}.")
         means.append(np.nanmean(cube[chosen], axis=0, dtype=np.float64))

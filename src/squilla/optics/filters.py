@@ -1,4 +1,4 @@
-"""Filter arrays: the thesis' stencil process, a measured table, and how good either is."""
+"""Arrays of thin-film filters, and the recipes that they are drawn from."""
 
 import math
 import tomllib
@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from torch import Generator, Tensor
 
 from squilla.errors import InputError
-from squilla.optics.materials import read_columns, refractive_index
-from squilla.optics.thinfilm import transmittance
-from squilla.spectra import resample
+from squilla.optics.materials import refractive_index
+from squilla.optics.tables import MeasuredFilters, read_table
+from squilla.optics.thinfilm import CACHED, Polarization, transmittance
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +24,9 @@ class FilterArray:
 
     material : names of the depositions' materials, L, from the glass outwards; see
         `refractive_index`.
-    thickness : (L,) of each deposition, nm.
-    layers : (M, L) bool, which layers each filter has.
+    thickness : (L,) of each deposition, nm; or (M, L) where each filter has its own.
+    layers : (M, L) bool, which layers each filter has. Further axes in front, here and in
+        `thickness`, make many arrays of it; the two are broadcast against each other.
     substrate : material of the glass plate, whose bare back face is counted, incoherently.
     scatter : factor on the transmittance for what roughness takes away, 0..1.
     """
@@ -37,8 +38,12 @@ class FilterArray:
     scatter: float = 1.0
 
     def __post_init__(self):
-        depositions = len(self.material)
-        if self.thickness.shape != (depositions,) or self.layers.shape[1:] != (depositions,):
+        depositions, shape = len(self.material), self.layers.shape
+        if (
+            len(shape) < 2
+            or any(given[-1:] != (depositions,) for given in (shape, self.thickness.shape))
+            or not _broadcasts(self.thickness.shape, shape)
+        ):
             raise InputError(
                 f"{depositions} materials need {depositions} thicknesses and a column of layers "
                 f"each; they are {tuple(self.thickness.shape)} and {tuple(self.layers.shape)}."
@@ -63,33 +68,54 @@ class FilterArray:
 
         Returns
         -------
-        Tensor, (M, K) for one angle, (A, M, K) for A angles, float64, 0..1
+        Tensor, (M, K) for one angle, (A, M, K) for A angles, float64, 0..1; many arrays (N, M, K)
+        and (N, A, M, K). Gradients flow to the thickness.
 
         Source: the incoherent back face, Macleod, Thin-Film Optical Filters, 5th ed., section 2.15;
         1/T = 1/T1 + 1/T2 - 1, exact where the film absorbs nothing.
         """
-        wavelength = np.asarray(wavelength, float)
+        wavelength, angle = np.asarray(wavelength, float), np.asarray(angle, float)
         table = {name: refractive_index(name, wavelength) for name in set(self.material)}
         index = np.stack([table[name] for name in reversed(self.material)])
         glass = refractive_index(self.substrate, wavelength)
-        total = torch.zeros(())
-        for polarization in ("s", "p"):
-            arguments: dict[str, Any] = {
-                "substrate": glass,
-                "angle": angle,
-                "polarization": polarization,
-            }
-            front = transmittance(index, self.stacks.flip(-1), wavelength, **arguments)
-            back = transmittance(index[:0], torch.zeros(0), wavelength, **arguments)
-            total = total + front * back / (front + back - front * back)
-        return (self.scatter / 2 * total).movedim(0, -2)
+        *many, filters, depositions = self.layers.shape
+        thickness = torch.atleast_2d(self.thickness)
+        thickness = thickness.expand(*many, *thickness.shape[-2:]).flip(-1)
+        few = max(1, CACHED // (filters * len(wavelength)))  # arrays at a time
+        parts = zip(
+            thickness.reshape(-1, thickness.shape[-2], depositions).split(few),
+            self.layers.flip(-1).reshape(-1, filters, depositions).split(few),
+            strict=True,
+        )
+        polarizations: tuple[Polarization, ...] = ("s", "p") if angle.any() else ("s",)
+        given: dict[str, Any] = {"substrate": glass, "angle": angle}
+        bare = [transmittance([], [], wavelength, polarization=p, **given) for p in polarizations]
+        plates = []
+        for thicknesses, layers in parts:
+            total = torch.zeros(())
+            for polarization, back in zip(polarizations, bare, strict=True):
+                front = transmittance(
+                    index,
+                    thicknesses,
+                    wavelength,
+                    layers=layers,
+                    polarization=polarization,
+                    **given,
+                )
+                total = total + front * back / (front + back - front * back)
+            plates.append(self.scatter / len(polarizations) * total)
+        plate = torch.cat(plates).reshape(*many, filters, *angle.shape, len(wavelength))
+        return plate.movedim(len(many), -2)
 
     def save(self, path: str | Path) -> None:
         """Write the array to a TOML file that `read_filters` reads."""
+        if self.layers.ndim != 2:
+            raise InputError(f"There are {len(self.layers)} arrays; save them one by one.")
         rows = ["".join("01"[int(layer)] for layer in row) for row in self.layers]
         lines = [
-            "# A filter array. Depositions count from the glass outwards, thickness in nm; each",
-            "# row of `layers` is a filter: 1 where it has the layer, 0 where it was left out.",
+            "# A filter array. Depositions count from the glass outwards, thickness in nm, a row",
+            "# for each filter where they differ; a row of `layers` is a filter: 1 where it has",
+            "# the layer, 0 where it was left out.",
             f"substrate = {dumps(self.substrate)}",
             f"scatter = {self.scatter!r}",
             f"material = {dumps(list(self.material))}",
@@ -99,6 +125,16 @@ class FilterArray:
             "]",
         ]
         Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _broadcasts(shape: torch.Size, to: torch.Size) -> bool:
+    try:
+        return torch.broadcast_shapes(shape, to) == to
+    except RuntimeError:
+        return False
+
+
+# --- recipes ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -142,92 +178,219 @@ class StencilRecipe:
                 f"layers, too few for {self.filters} filters."
             )
 
+    @property
+    def material(self) -> tuple[str, ...]:
+        """Materials of the depositions, L, from the glass outwards."""
+        return _alternating(self.high, self.low, self.depositions)
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """Least and greatest thickness of each deposition, (L,) nm."""
+        return _interval(_alternating(self.high_thickness, self.low_thickness, self.depositions))
+
     def draw(self, seed: int | Generator = 0) -> FilterArray:
         """Draw an array; the same seed gives the same array."""
-        generator = torch.Generator().manual_seed(seed) if isinstance(seed, int) else seed
-        high = torch.arange(self.depositions) % 2 == 0
+        generator = _generator(seed)
+        least, most = self.limits
         uniform = torch.rand(self.depositions, generator=generator, dtype=torch.float64)
-        least, most = (
-            torch.where(high, h, low)
-            for h, low in zip(self.high_thickness, self.low_thickness, strict=True)
-        )
-        absent: dict[frozenset[int], None] = {}  # a set that keeps its order
-        while len(absent) < self.filters:
-            count = int(
-                torch.randint(self.omitted[0], self.omitted[1] + 1, (), generator=generator)
-            )
-            order = torch.randperm(self.depositions, generator=generator)
-            absent[frozenset(order[:count].tolist())] = None
-        layers = torch.ones(self.filters, self.depositions, dtype=torch.bool)
-        for row, left_out in zip(layers, absent, strict=True):
-            row[list(left_out)] = False
-        material = tuple(self.high if h else self.low for h in high)
+        rows: dict[tuple[bool, ...], None] = {}  # a set that keeps its order
+        while len(rows) < self.filters:
+            rows[tuple(self.masks(1, generator)[0].tolist())] = None
         return FilterArray(
-            material, least + (most - least) * uniform, layers, self.substrate, self.scatter
+            self.material,
+            least + (most - least) * uniform,
+            torch.tensor(list(rows)),
+            self.substrate,
+            self.scatter,
         )
 
+    def masks(self, count: int, generator: Generator) -> Tensor:
+        """Draw ways to leave out layers of one filter, (count, L) bool, True where it has one."""
+        layers = torch.ones(count, self.depositions, dtype=torch.bool)
+        fewest, most = self.omitted
+        for row in layers:
+            omitted = int(torch.randint(fewest, most + 1, (), generator=generator))
+            row[torch.randperm(self.depositions, generator=generator)[:omitted]] = False
+        return layers
 
-@dataclass(frozen=True, eq=False)
-class MeasuredFilters:
-    """Filters known by a measured table of their transmittance, or response, at normal incidence.
 
-    wavelength : (K,) nm, increasing.
-    values : (M, K) transmittance, 0..1, or a response in any unit.
-    n_eff : effective index of the stack, for its blue shift at an angle; None: no shift.
+@dataclass(frozen=True)
+class FreeRecipe:
+    """Filters each with a stack of its own, in the materials and limits of the stencil process.
+
+    What an array could be if every filter were coated by itself; no cheap process makes it.
+
+    filters : M.  depositions : layers of each filter, L.
+    The other fields are those of `StencilRecipe`.
     """
 
-    wavelength: np.ndarray
-    values: np.ndarray
-    n_eff: float | None = None
+    filters: int = 36
+    depositions: int = 19
+    high: str = "TiO2/Franta"
+    low: str = "SiO2/Rodriguez-de-Marcos"
+    substrate: str = "substrate/D263TECO"
+    high_thickness: tuple[float, float] = (25.0, 145.0)
+    low_thickness: tuple[float, float] = (45.0, 255.0)
+    scatter: float = 0.97
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """Least and greatest thickness of each layer, (L,) nm."""
+        return _interval(_alternating(self.high_thickness, self.low_thickness, self.depositions))
+
+    def draw(self, seed: int | Generator = 0) -> FilterArray:
+        """Draw an array, each thickness uniform on its interval; its thickness is (M, L)."""
+        least, most = self.limits
+        shape = (self.filters, self.depositions)
+        uniform = torch.rand(shape, generator=_generator(seed), dtype=torch.float64)
+        return FilterArray(
+            _alternating(self.high, self.low, self.depositions),
+            least + (most - least) * uniform,
+            torch.ones(shape, dtype=torch.bool),
+            self.substrate,
+            self.scatter,
+        )
+
+    def masks(self, count: int, generator: Generator) -> None:
+        """There are no masks."""
+
+
+@dataclass(frozen=True)
+class FabryPerotRecipe:
+    """Cavities between two mirrors that all filters share, the spacer stepped from one to the next.
+
+    The spacer is one deposition on all filters and a few more of doubling thickness behind masks:
+    the binary digits of a filter's number say which of these it has. So the peaks step evenly
+    through the band. Drawn at random are the order of the cavity and the centre of the mirrors,
+    whose layers are a quarter wave.
+
+    filters : M.
+    mirror : layers in each mirror, odd; high index first and last.
+    order : (least, most), number of half waves in the spacer.
+    centre : (least, most) of the wavelength for which the mirrors are made, nm.
+    band : wavelengths of the first and the last filter's peak, nm.
+    spacer_thickness : (least, most) of a deposition of the spacer, nm.
+    The other fields are those of `StencilRecipe`.
+
+    Source: Macleod, Thin-Film Optical Filters, 5th ed., chapter on band-pass filters.
+    """
+
+    filters: int = 36
+    mirror: int = 3
+    order: tuple[int, int] = (1, 3)
+    centre: tuple[float, float] = (560.0, 690.0)
+    band: tuple[float, float] = (500.0, 750.0)
+    high: str = "TiO2/Franta"
+    low: str = "SiO2/Rodriguez-de-Marcos"
+    substrate: str = "substrate/D263TECO"
+    high_thickness: tuple[float, float] = (25.0, 145.0)
+    low_thickness: tuple[float, float] = (45.0, 255.0)
+    spacer_thickness: tuple[float, float] = (1.0, 1000.0)
+    scatter: float = 0.97
 
     def __post_init__(self):
-        if self.values.ndim != 2 or self.values.shape[1] != len(self.wavelength):
+        if self.mirror % 2 == 0 or self.filters < 2:
             raise InputError(
-                f"The filter table has the shape {self.values.shape}; with {len(self.wavelength)} "
-                f"wavelengths (filters, {len(self.wavelength)}) was expected."
+                f"A mirror of {self.mirror} layers and {self.filters} filters are no Fabry-Perot "
+                "array; give an odd number of layers, and 2 filters or more."
             )
-        if not (np.isfinite(self.values).all() and np.isfinite(self.wavelength).all()):
-            raise InputError("The filter table holds NaN or infinite values; repair the table.")
-        if not np.all(np.diff(self.wavelength) > 0):
-            raise InputError("The wavelengths of a filter table must increase.")
-        if self.n_eff is not None and not self.n_eff >= 1:
-            raise InputError(f"The effective index is {self.n_eff}; it must be 1 or more.")
 
-    def transmittance(self, wavelength: ArrayLike, angle: ArrayLike = 0.0) -> Tensor:
-        """Return the table on another grid, shifted to the blue at an angle.
+    @property
+    def digits(self) -> int:
+        """Depositions of the spacer that have masks."""
+        return (self.filters - 1).bit_length()
 
-        Parameters
-        ----------
-        wavelength : (K,)
-            nm, within the table. What the shift would read beyond the table's red end is the
-            table's last value.
-        angle : () or (A,)
-            Angle of incidence in air, rad.
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """Least and greatest thickness of each deposition, (L,) nm."""
+        mirror = _alternating(self.high_thickness, self.low_thickness, self.mirror)
+        return _interval((*mirror, *[self.spacer_thickness] * (1 + self.digits), *mirror))
 
-        Returns
-        -------
-        Tensor, (M, K) for one angle, (A, M, K) for A angles, float64
+    def draw(self, seed: int | Generator = 0) -> FilterArray:
+        """Draw an array; the same seed gives the same array."""
+        generator = _generator(seed)
+        order = int(torch.randint(self.order[0], self.order[1] + 1, (), generator=generator))
+        least, most = self.centre
+        centre = least + (most - least) * float(torch.rand((), generator=generator))
+        high, low = (float(refractive_index(m, centre)[0].real) for m in (self.high, self.low))
+        quarter = _alternating(centre / 4 / high, centre / 4 / low, self.mirror)
+        first, last = (order * peak / 2 / low for peak in self.band)
+        step = (last - first) / (self.filters - 1)
+        spacer = (first, *(step * 2**digit for digit in range(self.digits)))
+        number = torch.arange(self.filters)[:, None]
+        layers = torch.ones(self.filters, 2 * self.mirror + len(spacer), dtype=torch.bool)
+        chosen = slice(self.mirror + 1, self.mirror + len(spacer))
+        layers[:, chosen] = number // 2 ** torch.arange(self.digits) % 2 == 1
+        mirror = _alternating(self.high, self.low, self.mirror)
+        least, most = self.limits
+        thickness = torch.tensor((*quarter, *spacer, *quarter), dtype=torch.float64)
+        return FilterArray(
+            (*mirror, *[self.low] * len(spacer), *mirror),
+            thickness.clamp(least, most),
+            layers,
+            self.substrate,
+            self.scatter,
+        )
 
-        Source: Macleod, Thin-Film Optical Filters, 5th ed., the effective index of a tilted filter,
-        lambda' = lambda / sqrt(1 - (sin(angle) / n_eff)^2).
-        """
-        wavelength, angle = np.asarray(wavelength, float), np.asarray(angle, float)
-        first, last = self.wavelength[[0, -1]]
-        if wavelength.min() < first - 1e-6 or wavelength.max() > last + 1e-6:
-            raise InputError(
-                f"The filter table covers {first:g}-{last:g} nm, but {wavelength.min():g}-"
-                f"{wavelength.max():g} nm is needed; nothing is extrapolated."
-            )
-        sine = np.sin(angle[..., None]) / (self.n_eff or np.inf)
-        seen = (wavelength / np.sqrt(1 - sine**2)).clip(first, last)
-        return torch.from_numpy(np.moveaxis(resample(self.values, self.wavelength, seen), 0, -2))
+    def masks(self, count: int, generator: Generator) -> None:
+        """The masks count in binary; there is nothing to exchange."""
+
+
+def linear_variable_filter(
+    filters: int = 36,
+    band: tuple[float, float] = (500.0, 750.0),
+    *,
+    mirror: int = 5,
+    high: str = "TiO2/Franta",
+    low: str = "SiO2/Rodriguez-de-Marcos",
+    substrate: str = "substrate/D263TECO",
+    scatter: float = 0.97,
+) -> FilterArray:
+    """Return filters cut out of a wedge: one cavity, all layers of which grow along the band.
+
+    It leaks where its mirrors reflect no more, some 80 nm off each peak: a product would block that
+    with further filters.
+
+    Parameters
+    ----------
+    filters : int
+        M, evenly spaced along the wedge; the slope within each is not counted.
+    band : (float, float)
+        Peak of the first and the last filter, nm.
+    mirror : int
+        Layers in each of the two mirrors of quarter waves, odd; the spacer is a half wave of low
+        index.
+    high, low, substrate, scatter
+        As in `StencilRecipe`.
+    """
+    peak = torch.linspace(*band, filters, dtype=torch.float64)
+    middle = float(peak.mean())
+    n = {name: float(refractive_index(name, middle)[0].real) for name in (high, low)}
+    half = _alternating(high, low, mirror)
+    material = (*half, low, low, *half)  # the spacer as two quarter waves
+    quarter = torch.tensor([middle / 4 / n[name] for name in material], dtype=torch.float64)
+    layers = torch.ones(filters, len(material), dtype=torch.bool)
+    return FilterArray(material, peak[:, None] / middle * quarter, layers, substrate, scatter)
+
+
+def _alternating(high, low, count: int) -> tuple:
+    return tuple(low if i % 2 else high for i in range(count))
+
+
+def _interval(pairs: tuple[tuple[float, float], ...]) -> tuple[Tensor, Tensor]:
+    least, most = torch.tensor(pairs, dtype=torch.float64).T
+    return least, most
+
+
+def _generator(seed: int | Generator) -> Generator:
+    return torch.Generator().manual_seed(seed) if isinstance(seed, int) else seed
 
 
 # --- files ----------------------------------------------------------------------------------
 
 
 def read_filters(
-    path: str | Path, *, wavelength: ArrayLike | None = None, n_eff: float | None = None
+    path: str | Path, *, wavelength: ArrayLike | None = None, effective_index: float | None = None
 ) -> FilterArray | MeasuredFilters:
     """Read a filter array: a design in TOML, or a measured table of any common kind.
 
@@ -241,7 +404,7 @@ def read_filters(
     wavelength : (K,), optional
         nm; needed where the file holds none: for ``.npy`` always, for ``.npz`` and ``.mat`` unless
         a variable is named ``wavelength``, ``wavelengths`` or ``lambda``.
-    n_eff : float, optional
+    effective_index : float, optional
         Effective index for the shift of a measured table at an angle; None: no shift.
 
     Raises
@@ -252,28 +415,9 @@ def read_filters(
     path = Path(path)
     if not path.is_file():
         raise InputError(f"There is no file {path}.")
-    suffix = path.suffix.lower()
-    if suffix == ".toml":
+    if path.suffix.lower() == ".toml":
         return _read_design(path)
-    if suffix not in _TABLES:
-        raise InputError(
-            f"Filters cannot be read from {path.name}; expected .toml, {', '.join(_TABLES)}."
-        )
-    try:
-        values, own = _TABLES[suffix](path)
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise InputError(f"The filter table {path} cannot be read: {error}") from None
-    wavelength = own if wavelength is None else np.asarray(wavelength, float)
-    if wavelength is None:
-        raise InputError(
-            f"{path} names no wavelengths; pass wavelength=, one for each band, in nm."
-        )
-    if values.ndim == 2 and values.shape[1] != len(wavelength) == values.shape[0]:
-        values = values.T
-    order = np.argsort(wavelength) if values.shape[-1] == len(wavelength) else slice(None)
-    return MeasuredFilters(wavelength[order], values[..., order], n_eff)
+    return read_table(path, wavelength=wavelength, effective_index=effective_index)
 
 
 def _read_design(path: Path) -> FilterArray:
@@ -291,126 +435,3 @@ def _read_design(path: Path) -> FilterArray:
         raise
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path} is no filter array as `save` writes it: {error!r}.") from None
-
-
-def _matrix(variables: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the one matrix among named arrays and the wavelengths, if one is named so."""
-    arrays = {name: np.asarray(value) for name, value in variables.items()}
-    matrices = [
-        array
-        for array in arrays.values()
-        if array.ndim == 2 and min(array.shape) > 1 and np.issubdtype(array.dtype, np.number)
-    ]
-    if len(matrices) != 1:
-        raise InputError(
-            f"One matrix of filters was expected among {sorted(arrays)}, not {len(matrices)}; "
-            "save it alone."
-        )
-    named = [
-        array
-        for name, array in arrays.items()
-        if name.lower() in ("wavelength", "wavelengths", "lambda")
-    ]
-    return matrices[0].astype(float), named[0].astype(float).ravel() if named else None
-
-
-def _read_mat(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
-    try:
-        variables = loadmat(path)
-    except NotImplementedError:
-        raise InputError(f"{path} is of MATLAB's version 7.3; save it with '-v7'.") from None
-    except MatReadError as error:
-        raise InputError(f"The filter table {path} cannot be read: {error}.") from None
-    return _matrix({k: v for k, v in variables.items() if not k.startswith("__")})
-
-
-def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    with np.load(path) as table:
-        return _matrix(dict(table))
-
-
-def _read_npy(path: Path) -> tuple[np.ndarray, None]:
-    return np.load(path).astype(float), None
-
-
-def _read_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    columns = read_columns(path).T
-    return columns[1:], columns[0]
-
-
-def _read_netcdf(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    import xarray
-
-    with xarray.open_dataset(path, engine="h5netcdf") as dataset:
-        tables = [v for v in dataset.data_vars.values() if "wavelength" in v.coords and v.ndim == 2]
-        if len(tables) != 1:
-            raise InputError(
-                f"{path} holds {len(tables)} tables (filter, wavelength); expected one."
-            )
-        table = tables[0].transpose(..., "wavelength")
-        return table.to_numpy().astype(float), table["wavelength"].to_numpy().astype(float)
-
-
-_TABLES = {
-    ".csv": _read_text,
-    ".txt": _read_text,
-    ".npy": _read_npy,
-    ".npz": _read_npz,
-    ".mat": _read_mat,
-    ".nc": _read_netcdf,
-}
-
-
-# --- how good a filter array is -------------------------------------------------------------
-
-
-def mean_correlation(response: Tensor) -> Tensor:
-    """Return the mean absolute correlation of different rows of a response matrix, (M, K), 0..1."""
-    rows = len(response)
-    correlation = torch.corrcoef(response).abs()
-    return (correlation.sum() - rows) / (rows * (rows - 1))
-
-
-def mutual_coherence(response: Tensor) -> Tensor:
-    """Return the largest cosine between different columns of a response matrix, (M, K), 0..1.
-
-    At 0 the columns are orthogonal, at 1 two of them cannot be told apart, as is nearly so for
-    bands 1 nm apart: thin the bands, or multiply by a dictionary, (K, N), first.
-
-    Source: Donoho and Elad, PNAS 100, 2197 (2003).
-    """
-    column = torch.nn.functional.normalize(response, dim=0)
-    return (column.T @ column).abs().fill_diagonal_(0).max()
-
-
-def singular_values(response: Tensor) -> Tensor:
-    """Return the singular values of a response matrix, (M, K), relative to the largest, (M,)."""
-    values = torch.linalg.svdvals(response)
-    return values / values[0]
-
-
-def condition_number(response: Tensor) -> Tensor:
-    """Return the ratio of the largest to the smallest singular value of a matrix, (M, K)."""
-    return 1 / singular_values(response)[-1]
-
-
-def throughput(response: Tensor) -> Tensor:
-    """Return the mean of a response matrix, (M, K): the share of white light that arrives."""
-    return response.mean()
-
-
-def peak_density(response: Tensor, wavelength: ArrayLike) -> float:
-    """Return the number of maxima per 100 nm, averaged over the rows of a response, (M, K).
-
-    A maximum counts if it stands out by 5 % of the largest value, more than the noise of a measured
-    table does; those at the ends of the band do not count.
-    """
-    from scipy.signal import find_peaks
-
-    wavelength = np.asarray(wavelength, float)
-    rows = response.detach().cpu().numpy()
-    peaks = sum(len(find_peaks(row, prominence=0.05 * rows.max())[0]) for row in rows)
-    return float(100 * peaks / len(rows) / (wavelength[-1] - wavelength[0]))
