@@ -30,7 +30,7 @@ _HOME = {
     "show": "evaluation.plots",
 }
 
-__all__ = ["__version__", *_HOME]
+__all__ = ["__version__", *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 
 if TYPE_CHECKING:
     from squilla.calibration.alignment import Measurement, measure

@@ -38,7 +38,8 @@ def edges(
     """
     for smooth in _SMOOTHING:
         bell, slope = _derivative(smooth)
-        across, down = _gradient(images, bell, slope)
+        across, down = np.empty((2, *images.shape), np.float32)
+        _gradient(images, bell, slope, across, down)
         if noise is None:
             break
         power = (across**2 + down**2).mean((1, 2))
@@ -47,13 +48,14 @@ def edges(
             break
     taper = _taper(images.shape[1])[:, None] * _taper(images.shape[2])[None, :]
     weight = np.broadcast_to(taper, images.shape).copy()
-    for unit in range(len(images)) if bad is not None else ():
-        area = ndimage.minimum_filter(bad[unit], 3)  # single pixels are no area
+    for unit, wrong in enumerate(() if bad is None else bad):
+        area = ndimage.minimum_filter(wrong, 3)  # single pixels are no area
         if area.any():
             weight[unit][ndimage.maximum_filter(area, 3 + len(bell))] = 0
     feature = np.empty(images.shape, np.complex64)
     # The weakest edges are noise: their direction is shrunk to nothing.
-    floor = np.sqrt(np.median((across**2 + down**2)[:, ::4, ::4], (1, 2)))
+    power = across[:, ::4, ::4] ** 2 + down[:, ::4, ::4] ** 2
+    floor = np.sqrt(np.median(power, (1, 2)))
     _double_angle(across, down, floor, weight, feature)
     return torch.from_numpy(feature)
 
@@ -74,15 +76,9 @@ def _taper(size: int, share: float = 0.1) -> np.ndarray:
     return np.concatenate([ramp, np.ones(size - 2 * edge), ramp[::-1]]).astype(np.float32)
 
 
-def _gradient(images: np.ndarray, bell: np.ndarray, slope: np.ndarray):
-    """Return the smoothed gradient along columns and rows, two (M, H, W) float32."""
-    across, down = np.empty((2, *images.shape), np.float32)
-    _separable_gradient(images, bell, slope, across, down)
-    return across, down
-
-
 @numba.njit(parallel=True, cache=True, fastmath=True)
-def _separable_gradient(images, bell, slope, across, down):
+def _gradient(images, bell, slope, across, down):
+    """Fill in the smoothed gradient along columns and rows, (M, H, W) each."""
     units, rows, columns = images.shape
     reach = len(bell) // 2
     for unit in numba.prange(units):

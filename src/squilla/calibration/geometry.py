@@ -76,7 +76,8 @@ def _lit_areas(flat: np.ndarray, pitch: float) -> np.ndarray:
     coarse = coarse.reshape(size[0] // block, block, size[1] // block, block).mean((1, 3))
     middles = []
     for level in (0.03, 0.06, 0.12, 0.25, 0.5):
-        label, _ = ndimage.label(coarse > level * float(np.percentile(coarse, 99)))
+        label = np.empty(coarse.shape, np.int32)
+        ndimage.label(coarse > level * float(np.percentile(coarse, 99)), output=label)
         for box in ndimage.find_objects(label):
             if all(0.7 * pitch < block * (part.stop - part.start) < 1.1 * pitch for part in box):
                 middle = [block * (part.start + part.stop) / 2 - 0.5 for part in box]

@@ -51,7 +51,9 @@ class Stack:
         if first is None:
             raise InputError(f"There is no {kind} frame; at least one is needed, better eight.")
         mean = total / count
-        variance = (squares - count * mean**2) / (count - 1) if count > 1 else None
+        variance = None
+        if count > 1:
+            variance = np.asarray((squares - count * mean**2) / (count - 1))
         return cls(first + mean, variance, exposure, camera)
 
 

@@ -39,7 +39,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
         "wavelength": ("wavelength", calibration.wavelength, nm),
         "angle": ("angle", calibration.angle, {"units": "rad", "long_name": "field angle"}),
     }
-    attributes = {
+    attributes: dict = {
         "Conventions": "CF-1.11",
         "kind": _KIND,
         "provenance": json.dumps(calibration.provenance),
@@ -88,11 +88,11 @@ def load_calibration(path: str | Path) -> Calibration:
         lattice = pixels = None
         if "centre" in dataset:
             lattice = Lattice(
-                shape=tuple(int(size) for size in facts["lattice_shape"]),
+                shape=_pair(facts["lattice_shape"]),
                 centre=dataset["centre"].values,
                 baseline=dataset["baseline"].values,
                 reference=int(facts["lattice_reference"]),
-                field=tuple(int(size) for size in facts["lattice_field"]),
+                field=_pair(facts["lattice_field"]),
                 focal=float(facts["lattice_focal"]),
                 pitch=float(facts["lattice_pitch"]),
                 pixel=float(facts["lattice_pixel"]),
@@ -114,6 +114,11 @@ def load_calibration(path: str | Path) -> Calibration:
             pixels,
             json.loads(facts["provenance"]),
         )
+
+
+def _pair(values: np.ndarray) -> tuple[int, int]:
+    first, second = values
+    return int(first), int(second)
 
 
 def _packed(frame: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:

@@ -11,9 +11,9 @@ from squilla.camera.design import CameraDesign
 from squilla.errors import InputError
 
 _MANY, _FEW = 10.0, 0.05
-"""Shot noise is Poisson's law, drawn exactly up to so many electrons. Above, a normal number z gives
-mean + sqrt(mean) z + (z^2 - 1) / 6, which has its skewness too (Cornish and Fisher). Below so small a
-share of the read noise's variance it is added to that, which drowns its shape."""
+"""Shot noise follows Poisson's law, drawn exactly up to so many electrons. Above, a normal number z
+gives mean + sqrt(mean) z + (z^2 - 1) / 6, which has its skewness too (Cornish and Fisher). Below so
+small a share of the read noise's variance it is added to that, which drowns its shape."""
 
 _BANDS = 16
 """Bands of rows with a random generator each, so that noise does not depend on the threads."""

@@ -69,16 +69,16 @@ class Camera:
     def filters(self):
         """The filters, with a method ``transmittance(wavelength, angle)``."""
         filters = self.design.filters
-        if filters.recipe is not None:
-            count = self.design.units
-            return StencilRecipe(filters=count).draw(filters.seed)
-        measured = read_filters(filters.table, effective_index=filters.effective_index)
-        if len(measured.values) != self.design.units:
+        if filters.table is None:
+            return StencilRecipe(filters=self.design.units).draw(filters.seed)
+        array = read_filters(filters.table, effective_index=filters.effective_index)
+        count = len(array.transmittance(self.design.wavelength))
+        if count != self.design.units:
             raise InputError(
-                f"The filter table {filters.table} has {len(measured.values)} filters; the array "
-                f"has {self.design.units} units."
+                f"The filter file {filters.table} has {count} filters; the array has "
+                f"{self.design.units} units."
             )
-        return measured
+        return array
 
     @cached_property
     def angles(self) -> np.ndarray:
@@ -193,7 +193,8 @@ class Camera:
         if (exposure is None) == (snr is None):
             raise InputError("Give either an exposure in ms or an SNR in dB.")
         rate = self.rate(scene, distance=distance, depth=depth)
-        if snr is not None:
+        if exposure is None:
+            assert snr is not None
             exposure = self.sensor.exposure_for(self._fields(rate), snr)
         return self.expose(rate, exposure, generator)
 
@@ -263,7 +264,8 @@ class Camera:
         tallest = np.max(
             [[part.stop - part.start for part in window] for window in self.windows], 0
         )
-        size = tuple(_fast_length(int(length)) for length in tallest + 2 * margin + 2)
+        height, width = (_fast_length(int(length)) for length in tallest + 2 * margin + 2)
+        size = (height, width)
         transfer = blur.on_grid(size)
         response = torch.from_numpy(self._node_response).float()
         pixels = values.reshape(-1, values.shape[-1])
@@ -297,11 +299,12 @@ class Camera:
         first = np.floor(origin).astype(int) - margin
         position = on_axis + first - origin
         canvas = warp.weigh(seen, first, position, self.design.focal, self.angles**2, size)
-        if isinstance(plane, float):
+        flat = not isinstance(plane, np.ndarray)
+        if flat:
             transfer = transfer * _shift(origin - first, size)
         spectrum = (torch.fft.rfft2(torch.from_numpy(canvas)) * transfer).sum(0)
         image = torch.fft.irfft2(spectrum, s=size).numpy()
-        if isinstance(plane, float):
+        if flat:
             return image[:rows, :columns]
         return warp.relief(image, plane, first, origin, middle, baseline, (rows, columns))
 
@@ -415,4 +418,4 @@ def _middle(size: int, length: int) -> np.ndarray:
 def _fast_length(length: int) -> int:
     from scipy.fft import next_fast_len
 
-    return next_fast_len(length, real=True)
+    return int(next_fast_len(length, real=True) or length)

@@ -250,7 +250,7 @@ def read_depth(path: Path, shape: tuple[int, ...]):
         else:
             import tifffile
 
-            depth = tifffile.imread(path)
+            depth = np.asarray(tifffile.imread(path))
     except Exception as error:  # tifffile and NumPy fail on bad bytes in many ways
         raise InputError(f"The depth map {path} cannot be read: {error}.") from error
     if depth.ndim != 2 or depth.dtype.kind not in "uif":
@@ -258,5 +258,7 @@ def read_depth(path: Path, shape: tuple[int, ...]):
     if depth.shape != tuple(shape):
         from scipy.ndimage import zoom
 
-        depth = zoom(depth.astype(float), np.divide(shape, depth.shape), order=1, grid_mode=True)
+        depth = np.asarray(
+            zoom(depth.astype(float), np.divide(shape, depth.shape), order=1, grid_mode=True)
+        )
     return depth.astype(float)

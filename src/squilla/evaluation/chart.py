@@ -41,10 +41,9 @@ def patch_means(cube: ArrayLike, labels: np.ndarray, margin: int = 3) -> np.ndar
     cube, labels = np.asarray(cube), np.asarray(labels)
     if cube.shape[:2] != labels.shape:
         raise InputError(f"The cube is {cube.shape[:2]} px, but its labels are {labels.shape}.")
-    labels = inner(labels, margin)
-    means = []
+    inside, means = inner(labels, margin), []
     for patch in range(labels.max() + 1):
-        chosen = labels == patch
+        chosen = inside == patch
         if not chosen.any():
             raise InputError(f"A margin of {margin} px leaves nothing of patch {patch}.")
         means.append(np.nanmean(cube[chosen], axis=0, dtype=np.float64))

@@ -25,8 +25,8 @@ class Sparse(Reconstructor):
     The l1 weight follows the noise of each pixel: 0.025 x 10^(-0.06 SNR) times the largest
     correlation ||(R Psi)' y||_inf, that is 1.6e-3 at 20 dB. An atom has the height at which l1
     counts it as 1, the inverse square root of ||R psi||: with equal heights l1 favours broad lines
-    too much, with equal ||R psi|| narrow ones. Rule and heights were chosen on random natural, Gaussian and line
-    spectra at 15 to 40 dB.
+    too much, with equal ||R psi|| narrow ones. Rule and heights were chosen on random natural,
+    Gaussian and line spectra at 15 to 40 dB.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def gaussian_lines(wavelength: np.ndarray) -> np.ndarray:
 
 
 def two_step(
-    matrix: Tensor, y: Tensor, ratio: float, tolerance: float, most: int = 20_000
+    matrix: Tensor, y: Tensor, ratio: float | Tensor, tolerance: float, most: int = 20_000
 ) -> tuple[Tensor, Tensor]:
     """Minimise 1/2 ||y - A s||^2 + weight ||s||_1 over s >= 0 by monotone TwIST.
 
@@ -196,7 +196,7 @@ def two_step(
     ----------
     matrix : Tensor, (M, atoms), float64
     y : Tensor, (N, M)
-    ratio : float
+    ratio : float or Tensor, (N,)
         The weight as a fraction of ||A' y||_inf.
     tolerance : float
         Relative duality gap at which a problem ends.
