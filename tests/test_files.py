@@ -82,6 +82,7 @@ def test_sidecar_tells_exposure_of_others_frames(tmp_path, frame):
         (tmp_path / name).with_suffix(".json").write_text('{"exposure": 8, "camera": "IMX226"}')
         raw = read_raw(tmp_path / name)
         np.testing.assert_array_equal(raw.frame, frame)
+        assert raw.frame.flags.writeable
         assert (raw.exposure, raw.metadata) == (8.0, {"camera": "IMX226"})
 
 
@@ -309,6 +310,7 @@ def test_others_envi(tmp_path, interleave, order, unit, factor):
         assert scene.dtype == np.float32
         np.testing.assert_allclose(scene["wavelength"], [500, 550, 600, 700])
         np.testing.assert_array_equal(scene, stored[..., [1, 3, 2, 0]])
+        assert scene.values.flags.writeable
 
 
 @pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
@@ -375,6 +377,7 @@ def test_arrays_with_wavelengths_apart(tmp_path):
         scene = read_scene(tmp_path / "s.npy", wavelength=wavelength)
         np.testing.assert_array_equal(scene, stored.astype(np.float32))
         assert scene["wavelength"].values.tolist() == [500, 600, 700]
+    assert scene.values.flags.writeable, "in memory, not on disk"
     np.save(tmp_path / "first.npy", np.moveaxis(stored, -1, 0))
     scene = read_scene(tmp_path / "first.npy", wavelength=[500, 600, 700])
     np.testing.assert_array_equal(scene, stored.astype(np.float32))
@@ -399,6 +402,21 @@ def test_others_netcdf(tmp_path):
     scene = read_scene(tmp_path / "s.nc")
     np.testing.assert_allclose(scene["wavelength"], [500, 600, 700])
     np.testing.assert_array_equal(scene, stored.transpose(1, 2, 0)[..., ::-1])
+
+
+@pytest.mark.parametrize("description", ["", "5", "[]", '{"shape": [3, 4, 5]}', "ImageJ=1.0"])
+def test_others_tiff_need_wavelengths(tmp_path, description):
+    import tifffile
+
+    bands = np.random.default_rng(10).random((3, 4, 5), dtype=np.float32)
+    path = tmp_path / "s.tif"
+    tifffile.imwrite(path, bands, photometric="minisblack", description=description, metadata=None)
+    with pytest.raises(InputError, match="wavelength="):
+        read_scene(path)
+    scene = read_scene(path, wavelength=[500, 600, 700])
+    np.testing.assert_array_equal(scene, bands.transpose(1, 2, 0))
+    with pytest.raises(InputError, match="2 wavelengths"):
+        read_scene(path, wavelength=[500, 600])
 
 
 def test_scenes_that_are_none(tmp_path):
@@ -446,6 +464,8 @@ def test_cubes_that_cannot_be_saved(tmp_path, cube):
             save(wrong, tmp_path / "c.nc")
     with pytest.raises(InputError, match="end in"):
         save(cube, tmp_path / "c.xlsx")
+    with pytest.raises(InputError, match="rename"):
+        save(cube, tmp_path / "c.nc", extra={"radiance": cube})
     (tmp_path / "file").touch()
     (tmp_path / "folder.nc").mkdir()
     (tmp_path / "things.zarr").mkdir()

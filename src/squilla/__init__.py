@@ -19,7 +19,8 @@ _HOME = {
     "CameraDesign": "camera.design",
     "Camera": "camera.twin",
     "Calibration": "calibration.calibration",
-    "load_calibration": "calibration.calibration",
+    "calibrate": "calibration.calibrate",
+    "load_calibration": "calibration.store",
     "Measurement": "calibration.alignment",
     "measure": "calibration.alignment",
     "Reconstructor": "reconstruction.reconstructor",
@@ -29,11 +30,13 @@ _HOME = {
     "show": "evaluation.plots",
 }
 
-__all__ = ["__version__", *_HOME]
+__all__ = ["__version__", *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 
 if TYPE_CHECKING:
     from squilla.calibration.alignment import Measurement, measure
-    from squilla.calibration.calibration import Calibration, load_calibration
+    from squilla.calibration.calibrate import calibrate
+    from squilla.calibration.calibration import Calibration
+    from squilla.calibration.store import load_calibration
     from squilla.camera.design import CameraDesign
     from squilla.camera.twin import Camera
     from squilla.errors import InputError

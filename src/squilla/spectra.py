@@ -170,7 +170,7 @@ def gaussian_mixtures(
 
     success = torch.rand(count, generator=generator).clamp_min(1e-12)
     lines = (success.log() / np.log(0.7)).floor().long() + fewest
-    most = int(lines.max())
+    most = int(lines.max()) if count else 0
     low, high = round(float(wavelength[0])), round(float(wavelength[-1]))
     centre = torch.randint(low, high + 1, (count, most), generator=generator).float()
     height = torch.rand(count, most, generator=generator)
@@ -280,12 +280,48 @@ def _sum_of_lines(
     position = torch.as_tensor(np.asarray(wavelength), dtype=torch.float32)
     total = torch.zeros(len(centre), len(position))
     for line in range(centre.shape[1]):  # a loop, for the whole (N, lines, K) would not fit
-        offset = (position - centre[:, line, None]) / fwhm[:, line, None]
-        total += height[:, line, None] * torch.exp(-4 * np.log(2) * offset**2)
+        there = torch.nonzero(height[:, line])[:, 0]  # most spectra have few of the lines
+        offset = (position - centre[there, line, None]) / fwhm[there, line, None]
+        total[there] += height[there, line, None] * torch.exp(-4 * np.log(2) * offset**2)
     return total
 
 
 # --- colour ---------------------------------------------------------------------------------
+
+
+def tristimulus(spectrum: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
+    """Return what the three receptors of the CIE 1931 observer see, XYZ, in a scale of their own.
+
+    Wavelengths outside the band add nothing.
+
+    Parameters
+    ----------
+    spectrum : array, (..., K)
+        Photon radiance, any scale.
+    wavelength : array, (K,)
+        nm, increasing.
+
+    Returns
+    -------
+    array, (..., 3)
+
+    Source: CIE 015:2018 through colour-science.
+    """
+    import colour
+
+    wavelength = np.asarray(wavelength, float)
+    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    matching = np.stack(
+        [
+            np.interp(wavelength, observer.wavelengths, receptor, left=0, right=0)
+            for receptor in observer.values.T
+        ],
+        axis=-1,
+    )
+    step = np.gradient(wavelength) if len(wavelength) > 1 else np.ones(1)
+    matching = matching * (step / wavelength)[:, None]  # photons to power
+    spectrum = np.asarray(spectrum)
+    return spectrum @ matching.astype(np.result_type(spectrum.dtype, np.float32))
 
 
 def rgb(
@@ -315,32 +351,21 @@ def rgb(
     -------
     array, (..., 3), 0..1, gamma encoded
 
-    Source: CIE 015:2018 through colour-science; Bradford adaptation to D65.
+    Source: CIE 015:2018 through colour-science; adaptation to D65 by XYZ scaling.
     """
     import colour
 
-    wavelength = np.asarray(wavelength, float)
-    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    matching = np.stack(
-        [np.interp(wavelength, observer.wavelengths, channel) for channel in observer.values.T], -1
-    )
-    step = np.gradient(wavelength) if len(wavelength) > 1 else np.ones(1)
-    matching = matching * (step / wavelength)[:, None]  # photons to power
     white = np.ones(len(wavelength)) if white is None else np.asarray(white, float)
-    white_xyz = white @ matching
-    xyz = np.nan_to_num(np.asarray(cube)) @ matching / white_xyz[1]
+    white_xyz = tristimulus(white, wavelength)
+    xyz = tristimulus(np.nan_to_num(np.asarray(cube)), wavelength) / white_xyz[1]
     if exposure is None:
         exposure = float(np.percentile(xyz[..., 1], 99))
     xyz = xyz / max(exposure, 1e-12)
-    # Von Kries scaling in Bradford's cone space, written out so that the blue channel, nearly
-    # empty in a band that begins at 500 nm, cannot divide by zero.
-    cone = colour.adaptation.CHROMATIC_ADAPTATION_TRANSFORMS["Bradford"]
+    # Von Kries scaling of X, Y, Z themselves, as in CIELAB. Sharper cone spaces make their blue
+    # from a difference: in a band that begins at 500 nm, with hardly any blue, mostly noise.
     d65 = colour.xy_to_XYZ(colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"])
-    gain = (cone @ d65) / np.maximum(cone @ (white_xyz / white_xyz[1]), 1e-6)
-    adapted = xyz @ (np.linalg.inv(cone) @ np.diag(gain) @ cone).T
-    linear = np.clip(
-        adapted @ np.asarray(colour.models.RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB).T, 0, 1
-    )
+    adapted = xyz * (d65 / np.maximum(white_xyz / white_xyz[1], 1e-6))
+    linear = np.clip(adapted @ colour.models.RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB.T, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
@@ -349,9 +374,12 @@ def composite(
     wavelength: np.ndarray,
     bands: tuple[float, float, float] = (650.0, 550.0, 500.0),
     *,
+    white: np.ndarray | None = None,
     scale: float | None = None,
 ) -> np.ndarray:
     """Return three bands as red, green and blue: the thesis' picture of a cube.
+
+    The values are linear in the radiance; a gamma of 2.2 brings them nearer to what the eye sees.
 
     Parameters
     ----------
@@ -360,8 +388,10 @@ def composite(
         nm.
     bands : (float, float, float)
         Wavelengths shown as red, green, blue, nm; the nearest bands are taken.
+    white : array, (K,), optional
+        Spectrum that shall look white; the light of the scene. Default: equal at all wavelengths.
     scale : float, optional
-        Radiance that becomes 1; default: the 99.5th percentile of the three bands.
+        Radiance, relative to `white`, that becomes 1; default: the 99.5th percentile.
 
     Returns
     -------
@@ -369,6 +399,9 @@ def composite(
 
     Source: thesis, figures 5.1 to 5.5.
     """
-    picture = np.asarray(cube)[..., [int(np.abs(wavelength - band).argmin()) for band in bands]]
+    nearest = [int(np.abs(wavelength - band).argmin()) for band in bands]
+    picture = np.asarray(cube)[..., nearest]
+    if white is not None:
+        picture = picture / np.maximum(np.asarray(white, float)[nearest], 1e-12)
     scale = float(np.percentile(picture, 99.5)) if scale is None else scale
     return np.clip(np.nan_to_num(picture) / max(scale, 1e-12), 0, 1)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,9 @@ class Lattice:
     reference : index of the unit whose view is reconstructed.
     field : (H, W) px, size of the aligned sub-images.
     focal : focal length, px.
-    pitch : distance of neighbouring lenses, mm; ``distance = pitch * focal / disparity``.
+    pitch : nominal distance of neighbouring lenses, px.
+    pixel : size of a pixel, um; gives distances their scale.
+    usual : distance at which a scene without texture is taken to be, mm.
     """
 
     shape: tuple[int, int]
@@ -34,14 +37,16 @@ class Lattice:
     field: tuple[int, int]
     focal: float
     pitch: float
+    pixel: float
+    usual: float
 
     def disparity(self, distance: float) -> float:
         """Return the disparity of a plane at `distance` mm, px per lens pitch."""
-        return self.pitch * self.focal / distance
+        return self.pitch * self.focal * self.pixel / 1000 / distance
 
     def distance(self, disparity: float) -> float:
         """Return the distance in mm at which a plane has this disparity (px per pitch)."""
-        return self.pitch * self.focal / max(disparity, 1e-9)
+        return self.pitch * self.focal * self.pixel / 1000 / max(disparity, 1e-9)
 
     def field_angle(self) -> np.ndarray:
         """Return the chief-ray angle of every pixel of the reference view, (H, W) rad."""
@@ -53,19 +58,25 @@ class Lattice:
 class Pixels:
     """What dark and flat frames say of every pixel of the sensor.
 
-    dark : (rows, columns) DN, float32.
+    bias : (rows, columns) DN without light at no exposure, float32.
+    dark_rate : (rows, columns) DN per ms that the dark current adds, float32.
     flat : (rows, columns) relative response, float32; 1 at the response that `sensitivity` states.
     valid : (rows, columns) bool; False for dead, hot and unlit pixels.
     saturation : DN at and above which a pixel is not believed.
     gain : e-/DN.  read_noise : e-.
     """
 
-    dark: np.ndarray
+    bias: np.ndarray
+    dark_rate: np.ndarray
     flat: np.ndarray
     valid: np.ndarray
     saturation: float
     gain: float
     read_noise: float
+
+    def dark(self, exposure: float | None) -> np.ndarray:
+        """Return what a frame of this exposure (ms) shows without light, (rows, columns) DN."""
+        return self.bias + self.dark_rate * np.float32(exposure or 0.0)
 
 
 @dataclass(frozen=True)
@@ -182,6 +193,12 @@ class Calibration:
         for node, sensitivity in enumerate(self.sensitivities):
             total += weights[..., node, None] * (cube @ sensitivity.T)
         return total
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration as one NetCDF file; see `squilla.calibration.store`."""
+        from squilla.calibration.store import save_calibration
+
+        save_calibration(self, path)
 
     def on(self, wavelength: np.ndarray) -> "Calibration":
         """Return the same calibration on another wavelength grid within its own."""

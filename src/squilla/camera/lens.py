@@ -30,8 +30,8 @@ def defocus(design: CameraDesign, angle: np.ndarray, distance: float) -> tuple[n
     """
     lens, effects = design.lens, design.effects
     focal = lens.focal_length
-    index = refractive_index(lens.glass, design.wavelength).real
-    centre = refractive_index(lens.glass, np.array([lens.focus_wavelength])).real[0]
+    index = np.real(refractive_index(lens.glass, design.wavelength))
+    centre = np.real(refractive_index(lens.glass, np.array([lens.focus_wavelength])))[0]
     focal_length = focal * (centre - 1) / (index - 1) if effects.chromatic_focus else focal
     image = focal_length * np.ones(len(index)) + focal**2 / (1000 * distance)
     sensor = focal + focal**2 / (1000 * lens.focus_distance) + lens.defocus

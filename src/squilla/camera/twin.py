@@ -69,22 +69,22 @@ class Camera:
     def filters(self):
         """The filters, with a method ``transmittance(wavelength, angle)``."""
         filters = self.design.filters
-        if filters.recipe is not None:
-            count = self.design.units
-            return StencilRecipe(filters=count).draw(filters.seed)
-        measured = read_filters(filters.table, effective_index=filters.effective_index)
-        if len(measured.values) != self.design.units:
+        if filters.table is None:
+            return StencilRecipe(filters=self.design.units).draw(filters.seed)
+        array = read_filters(filters.table, effective_index=filters.effective_index)
+        count = len(array.transmittance(self.design.wavelength))
+        if count != self.design.units:
             raise InputError(
-                f"The filter table {filters.table} has {len(measured.values)} filters; the array "
-                f"has {self.design.units} units."
+                f"The filter file {filters.table} has {count} filters; the array has "
+                f"{self.design.units} units."
             )
-        return measured
+        return array
 
     @cached_property
     def angles(self) -> np.ndarray:
         """Field angles between which filters and blur are interpolated, (A,) rad.
 
-        Evenly in the squared angle: four up to the field's corner, two beyond, to the last lit pixel.
+        Evenly in the squared angle: four up to the field's corner, two beyond, to the last lit one.
         """
         size = np.array([self.design.field.size / np.sqrt(2), self._farthest])
         corner, last = np.arctan(size / self.design.focal) ** 2
@@ -193,19 +193,20 @@ class Camera:
         if (exposure is None) == (snr is None):
             raise InputError("Give either an exposure in ms or an SNR in dB.")
         rate = self.rate(scene, distance=distance, depth=depth)
-        if snr is not None:
+        if exposure is None:
+            assert snr is not None
             exposure = self.sensor.exposure_for(self._fields(rate), snr)
-        return self._expose(rate, exposure, generator)
+        return self.expose(rate, exposure, generator)
 
     def capture_flat(
         self, light: np.ndarray, exposure: float, *, generator: Generator | None = None
     ) -> Raw:
         """Take a frame of an evenly lit surface that fills every view, spectrum `light` (K,)."""
-        return self._expose(self.flat_rate(light), exposure, generator)
+        return self.expose(self.flat_rate(light), exposure, generator)
 
     def capture_dark(self, exposure: float, *, generator: Generator | None = None) -> Raw:
         """Take a frame with the lens covered."""
-        return self._expose(np.zeros(self.design.sensor_shape, np.float32), exposure, generator)
+        return self.expose(np.zeros(self.design.sensor_shape, np.float32), exposure, generator)
 
     def truth(
         self, scene: DataArray, *, distance: float = 300.0, depth: np.ndarray | None = None
@@ -224,7 +225,8 @@ class Camera:
         plane = np.full(values.shape[:2], distance) if depth is None else np.asarray(depth)
         return Truth(cube, far / plane[np.ix_(rows, columns)], self.design.centres)
 
-    def _expose(self, rate: np.ndarray, exposure: float, generator: Generator | None) -> Raw:
+    def expose(self, rate: np.ndarray, exposure: float, generator: Generator | None = None) -> Raw:
+        """Take a frame of the photoelectrons per ms, (rows, columns), that `rate` returned."""
         if not exposure > 0:
             raise InputError(f"The exposure must be a positive number of ms, not {exposure}.")
         frame = self.sensor.expose(rate, exposure, generator=generator)
@@ -244,7 +246,7 @@ class Camera:
         total = np.zeros(self.design.sensor_shape, np.float32)
         for unit, window in enumerate(self.windows):
             square, share = self._geometry[unit]
-            total[window] += share * np.interp(square, self.angles**2, rates[:, unit])
+            warp.add_flat(square, share, self.angles**2, rates[:, unit], total[window])
         return total
 
     def rate(
@@ -262,7 +264,8 @@ class Camera:
         tallest = np.max(
             [[part.stop - part.start for part in window] for window in self.windows], 0
         )
-        size = tuple(_fast_length(int(length)) for length in tallest + 2 * margin + 2)
+        height, width = (_fast_length(int(length)) for length in tallest + 2 * margin + 2)
+        size = (height, width)
         transfer = blur.on_grid(size)
         response = torch.from_numpy(self._node_response).float()
         pixels = values.reshape(-1, values.shape[-1])
@@ -296,11 +299,12 @@ class Camera:
         first = np.floor(origin).astype(int) - margin
         position = on_axis + first - origin
         canvas = warp.weigh(seen, first, position, self.design.focal, self.angles**2, size)
-        if isinstance(plane, float):
+        flat = not isinstance(plane, np.ndarray)
+        if flat:
             transfer = transfer * _shift(origin - first, size)
         spectrum = (torch.fft.rfft2(torch.from_numpy(canvas)) * transfer).sum(0)
         image = torch.fft.irfft2(spectrum, s=size).numpy()
-        if isinstance(plane, float):
+        if flat:
             return image[:rows, :columns]
         return warp.relief(image, plane, first, origin, middle, baseline, (rows, columns))
 
@@ -373,15 +377,21 @@ class Blur:
     cycles: np.ndarray
 
     @classmethod
-    def of(cls, transfer: np.ndarray, cycles: np.ndarray, tolerance: float = 5e-3) -> "Blur":
-        """Separate a transfer function (A, K, F) to a relative tolerance by its SVD."""
+    def of(cls, transfer: np.ndarray, cycles: np.ndarray, tolerance: float = 6e-4) -> "Blur":
+        """Separate a transfer function (A, K, F) to a relative tolerance by its SVD.
+
+        Low frequencies weigh more, for pictures are made of them and light must not be lost.
+        """
         angles, bands, _ = transfer.shape
-        left, values, right = np.linalg.svd(transfer.reshape(angles * bands, -1), False)
+        importance = 1 / (cycles + 0.01)
+        left, values, right = np.linalg.svd(
+            (transfer * importance).reshape(angles * bands, -1), False
+        )
         lost = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1] / np.sum(values**2))
         rank = max(1, int(np.sum(lost > tolerance)))
         weight = (left[:, :rank] * values[:rank]).reshape(angles, bands, rank)
         weight = torch.from_numpy(weight).float().permute(0, 2, 1).contiguous()
-        return cls(weight, right[:rank], cycles)
+        return cls(weight, right[:rank] / importance, cycles)
 
     def on_grid(self, size: tuple[int, int]) -> Tensor:
         """Return each term on the grid of a real FFT, times the pixel's aperture, (r, ...)."""
@@ -408,4 +418,4 @@ def _middle(size: int, length: int) -> np.ndarray:
 def _fast_length(length: int) -> int:
     from scipy.fft import next_fast_len
 
-    return next_fast_len(length, real=True)
+    return int(next_fast_len(length, real=True) or length)

@@ -1,7 +1,27 @@
-"""The inner loops of the twin: laying a scene on a canvas, and seeing a relief from beside."""
+"""The inner loops of the twin: flats, laying a scene on a canvas, seeing a relief from beside."""
 
 import numba
 import numpy as np
+
+
+@numba.njit(nogil=True, cache=True)
+def add_flat(square, share, nodes, rates, total):
+    """Add the light of an even surface to a window: share x rate at the squared field angle."""
+    rows, columns = total.shape
+    for row in range(rows):
+        for column in range(columns):
+            right, weight = _place(square[row, column], nodes)
+            rate = (1 - weight) * rates[right - 1] + weight * rates[right]
+            total[row, column] += share[row, column] * rate
+
+
+@numba.njit(cache=True)
+def _place(square, nodes):
+    """The node above a squared angle, and its weight in linear interpolation."""
+    right = 1
+    while right < len(nodes) - 1 and nodes[right] < square:
+        right += 1
+    return right, min((square - nodes[right - 1]) / (nodes[right] - nodes[right - 1]), 1.0)
 
 
 def relief(
@@ -92,12 +112,7 @@ def _weigh(seen, first, position, focal, nodes, canvas):
         for column in range(columns):
             x = _mirror(first[1] + column, seen.shape[1])
             radius = np.hypot(position[0] + row, position[1] + column)
-            square = np.arctan(radius / focal) ** 2
-            right = 1
-            while right < len(nodes) - 1 and nodes[right] < square:
-                right += 1
-            share = (square - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
-            share = min(share, 1.0)
+            right, share = _place(np.arctan(radius / focal) ** 2, nodes)
             for term in range(terms):
                 canvas[term, row, column] = (1 - share) * seen[y, x, right - 1, term] + (
                     share * seen[y, x, right, term]

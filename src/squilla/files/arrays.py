@@ -95,7 +95,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 def read_npy(path: Path) -> dict[str, np.ndarray]:
     """Read the one array of a .npy, under the name "cube"."""
     with reading(path, "NPY"):  # mapped, so that a header without its data is refused
-        return _numeric({"cube": np.load(path, mmap_mode="r", allow_pickle=False)})
+        return _numeric({"cube": np.array(np.load(path, mmap_mode="r", allow_pickle=False))})
 
 
 def read_mat(path: Path) -> dict[str, np.ndarray]:

@@ -23,6 +23,8 @@ SCENE_SUFFIXES = (*CUBE_SUFFIXES, *DATA_SUFFIXES, ".npz", ".npy", ".mat")
 
 _DIMS = ("y", "x", "wavelength")
 
+_CF = {"standard_name": "radiation_wavelength", "long_name": "wavelength", "units": "nm"}
+
 
 def labelled(
     values: np.ndarray,
@@ -46,8 +48,7 @@ def labelled(
     -------
     DataArray, (y, x, wavelength), with the CF attributes of a wavelength in nm
     """
-    about = {"standard_name": "radiation_wavelength", "long_name": "wavelength", "units": "nm"}
-    coordinate = ("wavelength", np.asarray(wavelength, float), about)
+    coordinate = ("wavelength", np.asarray(wavelength, float), _CF)
     return DataArray(values, {"wavelength": coordinate}, _DIMS, name, dict(attributes or {}))
 
 
@@ -78,7 +79,10 @@ def save(
     suffix = path.suffix.lower()
     if suffix not in CUBE_SUFFIXES:
         raise InputError(f"{path} must end in one of {', '.join(CUBE_SUFFIXES)} to be written.")
-    arrays = {str(cube.name or "cube"): _checked(cube)} | dict(extra or {})
+    arrays = {str(cube.name or "cube"): _checked(cube)}
+    if extra and not arrays.keys().isdisjoint(extra):
+        raise InputError(f"An extra has the name of the cube itself, {cube.name!r}; rename it.")
+    arrays |= extra or {}
     arrays = {name: _plain(array.rename(name)) for name, array in arrays.items()}
     if suffix in (".nc", ".zarr"):
         dataset = xr.Dataset(arrays)
@@ -170,8 +174,7 @@ def _checked(cube: DataArray) -> DataArray:
     if cube.dtype.kind not in "iuf":
         raise InputError(f"A cube holds real numbers; this one holds {cube.dtype}.")
     cube = cube.transpose(*_DIMS)
-    about = {"standard_name": "radiation_wavelength", "long_name": "wavelength", "units": "nm"}
-    cube = cube.assign_coords(wavelength=cube["wavelength"].assign_attrs(about))
+    cube = cube.assign_coords(wavelength=cube["wavelength"].assign_attrs(_CF))
     if not (np.diff(cube["wavelength"]) > 0).all():
         raise InputError("The wavelengths of a cube must increase from band to band.")
     return cube
@@ -211,8 +214,8 @@ def _in_nanometres(cube: DataArray, path: Path) -> DataArray:
         )
     result = labelled(cube.values, wavelength, name=str(cube.name), attributes=cube.attrs)
     for name, coordinate in cube.drop_vars("wavelength").coords.items():
-        scale = factor if name == "fwhm" else 1
-        result = result.assign_coords({name: (coordinate.dims, coordinate.values * scale)})
+        values = coordinate.values * factor if name == "fwhm" else coordinate.values
+        result = result.assign_coords({name: (coordinate.dims, values, coordinate.attrs)})
     order = np.argsort(wavelength, kind="stable")
     twice = wavelength[order][:-1][np.diff(wavelength[order]) == 0]
     if len(twice):
@@ -264,7 +267,7 @@ def _read(path: Path, variable: str | None, wavelength: np.ndarray | None) -> Da
             f"{path} has {cube.sizes['wavelength']} bands, but {len(wavelength)} wavelengths are "
             "given."
         )
-    return cube.assign_coords(wavelength=wavelength)
+    return cube.drop_vars("fwhm", errors="ignore").assign_coords(wavelength=wavelength)
 
 
 def _read_dataset(
@@ -357,15 +360,18 @@ def _read_tiff(path: Path) -> DataArray:
         first = tiff.pages.first
         check_size(path, len(tiff.pages) * first.nbytes)
         bands = np.stack([page.asarray() for page in tiff.pages])
+        if bands.ndim != 3:
+            raise InputError(f"{path} must hold one grey page for each band.")
         try:
             told = json.loads(first.description)
         except ValueError:
-            told = {}
-    if bands.ndim != 3:
-        raise InputError(f"{path} must hold one grey page for each band.")
-    coords = {}
-    for key in ("wavelength", "fwhm"):
-        if len(told.get(key, ())) == len(bands):
-            coords[key] = ("wavelength", np.array(told[key], float))
-    values = np.ascontiguousarray(bands.transpose(1, 2, 0))
-    return DataArray(values, coords, _DIMS, told.get("name", path.stem), told.get("attributes", {}))
+            told = None
+        if not isinstance(told, dict) or "wavelength" not in told:
+            told = {"name": path.stem, "attributes": {}}  # others' files describe other things
+        coords = {
+            key: ("wavelength", np.array(told[key], float))
+            for key in ("wavelength", "fwhm")
+            if key in told
+        }
+        values = np.ascontiguousarray(bands.transpose(1, 2, 0))
+        return DataArray(values, coords, _DIMS, told["name"], told["attributes"])

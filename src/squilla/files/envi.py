@@ -127,7 +127,7 @@ def read_envi(path: Path) -> DataArray:
         with reading(path, "ENVI"):
             ours = json.loads(unquote(header["squilla"]))
             name, attributes = ours["name"], ours["attributes"]
-    values = np.ascontiguousarray(values, values.dtype.newbyteorder("="))
+    values = np.array(values, values.dtype.newbyteorder("="), order="C")  # off the disk
     return DataArray(values, coords, ("y", "x", "wavelength"), name, attributes)
 
 

@@ -161,7 +161,7 @@ def _read_png(path: Path) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
 
     with reading(path, "PNG"), Image.open(path, formats=["PNG"]) as image:
         check_size(path, 2 * image.width * image.height)
-        frame = np.asarray(image)
+        frame = np.array(image)  # a copy, for Pillow's own memory is read-only
     if image.mode == "I":  # some versions of Pillow widen 16-bit grey to 32 bits
         frame = frame.astype(np.uint16)
     yield frame, {}

@@ -1,0 +1,116 @@
+"""The whole calibration: from frames of a camera to one `Calibration`."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from squilla import __version__
+from squilla.calibration.alignment import windows
+from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.geometry import lattice_from_flat, refine_with_target
+from squilla.calibration.pixels import Darks, Stack, defective, noise_of
+from squilla.calibration.sensitivity import SweepStep, Zones, sweep_responses, unfold
+from squilla.camera.design import CameraDesign
+from squilla.errors import InputError
+from squilla.files.raw import Raw
+
+
+def calibrate(
+    design: CameraDesign,
+    *,
+    dark: Iterable[Raw],
+    flat: Iterable[Raw],
+    sweep: Iterable[SweepStep],
+    target: Raw | None = None,
+    target_distance: float | None = None,
+) -> Calibration:
+    """Learn a camera from its frames.
+
+    Parameters
+    ----------
+    design : CameraDesign
+        For what a maker knows: shape of the array, pitch, focal length, stop, band.
+    dark, flat : iterable of Raw
+        Several frames each, without light and of an evenly lit surface at about half scale.
+    sweep : iterable of SweepStep
+        Flat frames in narrow-band light over the whole band.
+    target : Raw, optional
+        One frame of a textured plane facing the camera; refines the lattice lens by lens.
+    target_distance : float, optional
+        Its distance, mm.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    InputError
+        If the frames do not show what they should; the message names the frame.
+    """
+    darks = Darks.of(dark)
+    flats = Stack.of(flat, "flat")
+    if darks.bias.shape != design.sensor_shape or flats.mean.shape != design.sensor_shape:
+        raise InputError(
+            f"The frames have {darks.bias.shape} and {flats.mean.shape} px, the design "
+            f"{design.sensor_shape}; take them with the camera of the design."
+        )
+    saturation = 0.98 * (2**design.sensor.bits - 1)
+    light = flats.mean - darks.at(flats.exposure)
+    lattice = lattice_from_flat(light, design)
+    if np.mean(windows(flats.mean, lattice, 0)[1] >= saturation) > 1e-3:
+        raise InputError("The flat frames are saturated; shorten their exposure.")
+    score = float("nan")
+    if target is not None:
+        if target_distance is None or not target_distance > 0:
+            raise InputError("Give the distance of the target in mm.")
+        share = np.where(light > 0, light / max(float(np.percentile(light, 99)), 1e-9), 1.0)
+        corrected = (target.frame - darks.at(target.exposure)) / np.maximum(share, 0.02)
+        lattice, score = refine_with_target(corrected, lattice, target_distance)
+    lit = _lit(light, lattice)
+    gain, read_noise = noise_of(darks.shortest, flats, lit)
+
+    rough = Zones(lattice, lit)
+    surface = rough.surface(lattice, rough(light.__getitem__), light.shape)
+    relative = np.where(lit, light / np.maximum(surface, 1e-6), 1.0).astype(np.float32)
+    valid = ~defective(darks.at(flats.exposure), relative, lit)
+    zones = Zones(lattice, valid)
+    surface = zones.surface(lattice, zones(light.__getitem__), light.shape)
+    relative = np.where(valid, light / np.maximum(surface, 1e-6), 1.0).astype(np.float32)
+
+    bias = np.where(lit, darks.bias, np.median(darks.bias)).astype(np.float32)
+    dark_rate = np.where(lit, darks.rate, 0).astype(np.float32)
+    wavelength, bandwidth, response = sweep_responses(sweep, darks, relative, saturation, zones)
+    sensitivity = np.maximum(unfold(wavelength, bandwidth, response, design.wavelength), 0)
+    return Calibration(
+        design.wavelength,
+        sensitivity,
+        zones.angle,
+        lattice,
+        Pixels(bias, dark_rate, relative, valid, saturation, gain, read_noise),
+        {
+            "software": f"squilla {__version__}",
+            "design": design.name,
+            "camera": flats.camera,
+            "sweep_steps": len(wavelength),
+            "target_distance": target_distance or 0.0,
+            "target_score": score,
+            "bad_pixels": int((~windows(valid, lattice, 0)[1]).sum()),
+        },
+    )
+
+
+def _lit(light: np.ndarray, lattice: Lattice) -> np.ndarray:
+    """Return the pixels that the flat lights to a fifth at least of their own sub-image."""
+    lit = np.zeros(light.shape, bool)
+    reach = lattice.pitch * 0.75
+    for centre, size in zip(lattice.centre, [lattice.field] * len(lattice.centre), strict=True):
+        core = [
+            slice(round(c - s / 4), round(c + s / 4)) for c, s in zip(centre, size, strict=True)
+        ]
+        window = tuple(
+            slice(max(int(c - reach), 0), min(int(c + reach) + 1, length))
+            for c, length in zip(centre, light.shape, strict=True)
+        )
+        lit[window] |= light[window] > 0.2 * np.median(light[tuple(core)])
+    return lit

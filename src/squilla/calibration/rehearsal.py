@@ -1,0 +1,127 @@
+"""The calibration rehearsed with the twin: the frames that a lab would take of its own camera."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+from torch import Generator
+from xarray import DataArray
+
+from squilla.calibration.sensitivity import SweepStep
+from squilla.camera.twin import Camera
+from squilla.files.raw import Raw
+
+
+class Rehearsal:
+    """Darks, flats, a narrow-band sweep and a poster, captured by the twin.
+
+    Parameters
+    ----------
+    camera : Camera
+    seed : int
+        Of the noise of all frames.
+    frames : int
+        Number of darks and of flats.
+    step, bandwidth : float
+        Of the sweep, nm; bandwidth is the full width at half maximum.
+    power_error : float
+        Relative error with which the reference detector knows the power of each step.
+    distance : float
+        Of the poster, mm.
+
+    The frames are made when asked for, one by one: a sweep is larger than a memory.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        *,
+        seed: int = 0,
+        frames: int = 8,
+        step: float = 4.0,
+        bandwidth: float = 4.0,
+        power_error: float = 0.0,
+        distance: float = 300.0,
+    ):
+        self.camera = camera
+        self.seed = seed
+        self.frames = frames
+        self.bandwidth = bandwidth
+        self.power_error = power_error
+        self.distance = distance
+        band = camera.design.band
+        count = int(np.ceil((band.stop - band.start) / step)) + 1
+        self.wavelengths = np.linspace(band.start, band.stop, count)
+        self._light = np.ones(len(camera.design.wavelength))
+
+    def dark(self) -> Iterator[Raw]:
+        """Yield frames with the lens covered, as long as the flats and as the steps at the ends.
+
+        Those need the longest exposures: half of their light is blocked.
+        """
+        flat = self._exposure(self.camera.flat_rate(self._light))
+        longest = max(
+            self._exposure(self.camera.flat_rate(self._band(w))) for w in self.wavelengths[[0, -1]]
+        )
+        for kind, exposure in enumerate((flat, longest)):
+            for number in range(self.frames):
+                generator = self._generator(5 + kind, number)
+                yield self.camera.capture_dark(exposure, generator=generator)
+
+    def flat(self) -> Iterator[Raw]:
+        """Yield frames of an evenly lit white surface."""
+        rate = self.camera.flat_rate(self._light)
+        for number in range(self.frames):
+            yield self.camera.expose(rate, self._exposure(rate), self._generator(2, number))
+
+    def sweep(self) -> Iterator[SweepStep]:
+        """Yield flat frames in narrow-band light, each exposed to the same level."""
+        for number, wavelength in enumerate(self.wavelengths):
+            generator = self._generator(3, number)
+            rate = self.camera.flat_rate(self._band(wavelength))
+            raw = self.camera.expose(rate, self._exposure(rate), generator)
+            error = self.power_error * float(torch.randn(1, generator=generator))
+            yield SweepStep(raw, float(wavelength), 1.0 + error, self.bandwidth)
+
+    def target(self) -> Raw:
+        """Return a frame of a textured poster at `distance`, facing the camera."""
+        scene = poster(self.camera.design.field.size + 100, self.camera.design.wavelength)
+        rate = self.camera.rate(scene, distance=self.distance)
+        return self.camera.expose(rate, self._exposure(rate), self._generator(4, 0))
+
+    def _band(self, wavelength: float) -> np.ndarray:
+        """Return the light of one step, (K,); all of it together, also beyond the band, is 1."""
+        design = self.camera.design
+        sigma = self.bandwidth / np.sqrt(8 * np.log(2))
+        band = np.exp(-((design.wavelength - wavelength) ** 2) / (2 * sigma**2))
+        return band * design.band.step / (sigma * np.sqrt(2 * np.pi))
+
+    def _exposure(self, rate: np.ndarray) -> float:
+        """Return the exposure at which the brightest sub-image fills 70 % of the scale, ms."""
+        return 0.7 * self.camera.design.sensor.full_well / float(rate.max())
+
+    def _generator(self, kind: int, number: int) -> Generator:
+        return torch.Generator().manual_seed(1_000_003 * self.seed + 10_007 * kind + number)
+
+
+def poster(size: int, wavelength: np.ndarray, seed: int = 0) -> DataArray:
+    """Return a grey texture with detail at many scales, a printed alignment target.
+
+    Parameters
+    ----------
+    size : int
+        Height and width, px.
+    wavelength : array, (K,)
+        nm.
+    """
+    noise = np.random.default_rng(seed).standard_normal((4, size, size))
+    layers = [gaussian_filter(layer, 1.2 * 2**level) for level, layer in enumerate(noise)]
+    texture = sum(layer / layer.std() for layer in layers)
+    grey = np.clip(0.45 + 0.15 * texture, 0.05, 0.95).astype(np.float32)
+    values = np.repeat(grey[..., None], len(wavelength), -1)
+    return DataArray(
+        values,
+        dims=("y", "x", "wavelength"),
+        coords={"wavelength": ("wavelength", wavelength, {"units": "nm"})},
+    )

@@ -1,0 +1,36 @@
+"""Every command in one place; each loads what it needs when it runs."""
+
+from typing import Annotated
+
+import typer
+
+from squilla import __version__
+from squilla.cli import camera, filters, steps
+from squilla.cli.train import train
+
+app = typer.Typer(
+    name="squilla",
+    help="Snapshot computational hyperspectral cameras: design, simulate, calibrate, reconstruct.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+app.command()(steps.demo)
+app.command()(camera.camera)
+app.add_typer(filters.app, name="filters", help="Filter arrays: analyse.")
+app.command()(steps.simulate)
+app.command()(camera.rehearse)
+app.command()(steps.calibrate)
+app.command()(train)
+app.command()(steps.reconstruct)
+app.command()(steps.evaluate)
+app.command()(camera.models)
+
+
+@app.callback(invoke_without_command=True)
+def _main(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        typer.echo(f"squilla {__version__}")
+        raise typer.Exit

@@ -1,0 +1,121 @@
+"""``squilla camera``, ``rehearse`` and ``models``: what is there to work with."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def camera(
+    design: Annotated[str, typer.Argument(help="thesis, or a TOML file.")] = "thesis",
+    toml: Annotated[bool, typer.Option("--toml", help="Print the design to start from.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print every figure as JSON.")] = False,
+) -> None:
+    """Show and check a camera design.
+
+    Example: squilla camera thesis --toml > mine.toml; squilla camera mine.toml
+    """
+    from squilla.camera.design import CameraDesign, design_path
+
+    read = CameraDesign.load(design)
+    if toml:
+        typer.echo(design_path(design).read_text(encoding="utf-8"), nl=False)
+        return
+    if as_json:
+        typer.echo(read.model_dump_json(indent=2))
+        return
+    size, band, sensor = read.field.size, read.band, read.sensor
+    rows = {
+        "camera": read.name,
+        "units": f"{read.array.rows} x {read.array.columns}, {read.pitch:.1f} px apart",
+        "sub-images": f"{size} x {size} px, {len(read.wavelength)} bands "
+        f"{band.start:g}-{band.stop:g} nm",
+        "sensor": f"{sensor.columns} x {sensor.rows} px of {sensor.pixel:g} um, {sensor.bits} bit, "
+        f"{sensor.gain:.2f} e-/DN",
+        "lens": f"f {read.lens.focal_length / 1000:g} mm, "
+        f"F/{read.lens.focal_length / read.lens.diameter:g}",
+        "filters": f"{read.filters.recipe} recipe, seed {read.filters.seed}"
+        if read.filters.recipe
+        else f"table {read.filters.table}",
+        "stop": "none: sub-images overlap"
+        if read.stop is None
+        else f"{read.stop.width:g} mm square at {read.stop.distance:g} mm",
+        "effects off": ", ".join(k for k, on in read.effects.model_dump().items() if not on)
+        or "none",
+    }
+    for name, value in rows.items():
+        typer.echo(f"{name:<12} {value}")
+
+
+def rehearse(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
+    step: Annotated[float, typer.Option(help="Of the sweep, nm.")] = 5.0,
+    frames: Annotated[int, typer.Option(help="Darks and flats of each exposure.")] = 8,
+    distance: Annotated[float, typer.Option(help="Of the poster, mm.")] = 300.0,
+    power_error: Annotated[float, typer.Option(help="Of the reference detector, relative.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
+) -> None:
+    """Let the twin take all calibration frames that `squilla calibrate` wants.
+
+    Example: squilla rehearse -o frames
+    """
+    from rich.progress import track
+
+    from squilla.calibration.rehearsal import Rehearsal
+    from squilla.camera.twin import Camera
+    from squilla.errors import InputError
+    from squilla.files.disk import replacing
+    from squilla.files.raw import write_raw
+
+    if not step > 0 or frames < 1:
+        raise InputError("The step must be positive and the number of frames at least 1.")
+    twin = Camera(camera)
+    rehearsal = Rehearsal(
+        twin, seed=seed, frames=frames, step=step, bandwidth=step,
+        power_error=power_error, distance=distance,
+    )  # fmt: skip
+    for folder in ("dark", "flat", "sweep"):
+        try:
+            (output / folder).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"The folder {output} cannot be made: {error.strerror}.") from error
+    for number, raw in enumerate(track(rehearsal.dark(), "darks", total=2 * frames)):
+        write_raw(output / "dark" / f"{number:03d}.tiff", raw)
+    for number, raw in enumerate(track(rehearsal.flat(), "flats", total=frames)):
+        write_raw(output / "flat" / f"{number:03d}.tiff", raw)
+    table = [("file", "wavelength", "power", "bandwidth")]
+    count = len(rehearsal.wavelengths)
+    for number, one in enumerate(track(rehearsal.sweep(), "sweep", total=count)):
+        name = f"{number:03d}.tiff"
+        write_raw(output / "sweep" / name, one.raw)
+        table.append((name, f"{one.wavelength:g}", f"{one.power:.6g}", f"{one.bandwidth:g}"))
+    with (
+        replacing(output / "sweep" / "sweep.csv") as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as stream,
+    ):
+        csv.writer(stream).writerows(table)
+    write_raw(output / "target.tiff", rehearsal.target())
+    typer.echo(
+        f"{output}: now run\n  squilla calibrate --camera {camera} --dark {output}/dark "
+        f"--flat {output}/flat --sweep {output}/sweep --target {output}/target.tiff "
+        f"--target-distance {distance:g} -o camera.nc"
+    )
+
+
+def models(
+    as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False,
+) -> None:
+    """List the reconstructors.
+
+    Example: squilla models
+    """
+    from squilla.reconstruction.reconstructor import models
+
+    if as_json:
+        typer.echo(json.dumps(models(), indent=2))
+        return
+    for name, line in models().items():
+        typer.echo(f"{name:<10} {line}")

@@ -1,0 +1,264 @@
+"""The steps from scene to verdict, one by one on files, and all of them as the demo."""
+
+import csv
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from squilla.errors import InputError
+
+if TYPE_CHECKING:
+    from squilla.calibration.sensitivity import SweepStep
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
+    snr: Annotated[float, typer.Option(help="Of the captures, dB.")] = 20.0,
+    distance: Annotated[float, typer.Option(help="Of the scenes, mm.")] = 300.0,
+    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Send three scenes through the camera and back, and write a report.
+
+    Example: squilla demo -o demo
+    """
+    from squilla.demo import demo
+
+    metrics = demo(output, camera=camera, snr=snr, distance=distance, seed=seed)
+    if as_json:
+        typer.echo(json.dumps(metrics))
+        return
+    for scene, models in metrics.items():
+        aligned = models["alignment_rms_px"]
+        typer.echo(f"\n{scene}: aligned to {aligned:.3f} px")
+        typer.echo(
+            f"  {'model':<10}{'MSE':>10}{'RMSE':>10}{'SAM, deg':>10}{'PSNR, dB':>10}{'s':>8}"
+        )
+        for name, judged in models.items():
+            if isinstance(judged, dict):
+                typer.echo(
+                    f"  {name:<10}{judged['mse']:>10.5f}{judged['rmse']:>10.4f}"
+                    f"{judged['sam_deg']:>10.2f}{judged['psnr_db']:>10.2f}{judged['seconds']:>8.2f}"
+                )
+    typer.echo(f"\n{output / 'report.html'}")
+
+
+def simulate(
+    scene: Annotated[str, typer.Argument(help="chart, indian-pines, corn-kernel, or a file.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Raw frame to write.")],
+    camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
+    distance: Annotated[float, typer.Option(help="Of a plane scene, mm.")] = 300.0,
+    depth: Annotated[Path | None, typer.Option(help="Depth map, mm: .npy or .tiff.")] = None,
+    snr: Annotated[float | None, typer.Option(help="Wanted, dB.")] = None,
+    exposure: Annotated[float | None, typer.Option(help="ms, instead of an SNR.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    truth: Annotated[
+        Path | None, typer.Option(help="Also write what a perfect camera would see.")
+    ] = None,
+) -> None:
+    """Capture a scene with the twin.
+
+    Example: squilla simulate chart -o raw.tiff --snr 20 --truth truth.nc
+    """
+    import torch
+
+    from squilla.camera.scenes import load_scene
+    from squilla.camera.twin import Camera
+    from squilla.files.cube import save
+    from squilla.files.raw import write_raw
+
+    if snr is None and exposure is None:
+        snr = 20.0
+    twin = Camera(camera)
+    picture = load_scene(scene, twin.design.wavelength, twin.design.field.size)
+    relief = None if depth is None else read_depth(depth, picture.shape[:2])
+    raw = twin.capture(
+        picture,
+        distance=distance,
+        depth=relief,
+        snr=snr,
+        exposure=exposure,
+        generator=torch.Generator().manual_seed(seed),
+    )
+    write_raw(output, raw)
+    if truth is not None:
+        save(twin.truth(picture, distance=distance, depth=relief).cube, truth)
+    typer.echo(f"{output}: {raw.frame.shape[0]} x {raw.frame.shape[1]} px, {raw.exposure:.3g} ms")
+
+
+def calibrate(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Calibration to write, .nc.")],
+    dark: Annotated[Path, typer.Option(help="Frames without light: a file or folder.")],
+    flat: Annotated[Path, typer.Option(help="Frames of an even white: a file or folder.")],
+    sweep: Annotated[Path, typer.Option(help="Folder with narrow-band flats and sweep.csv.")],
+    target: Annotated[Path | None, typer.Option(help="Frame of a textured plane.")] = None,
+    target_distance: Annotated[float | None, typer.Option(help="Its distance, mm.")] = None,
+    camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
+    as_json: Json = False,
+) -> None:
+    """Learn a camera from its frames.
+
+    sweep.csv has the columns file, wavelength (nm), power (photon radiance of the light) and
+    bandwidth (nm, full width at half maximum).
+
+    Example: squilla calibrate --dark dark --flat flat --sweep sweep --target target.tiff
+    --target-distance 300 -o camera.nc
+    """
+    from rich.progress import track
+
+    from squilla.calibration.calibrate import calibrate
+    from squilla.camera.design import CameraDesign
+    from squilla.files.raw import read_raw, read_raws
+
+    steps = read_sweep(sweep)
+    calibration = calibrate(
+        CameraDesign.load(camera),
+        dark=track(read_raws(dark), "darks", disable=as_json),
+        flat=track(read_raws(flat), "flats", disable=as_json),
+        sweep=track(steps, "sweep", disable=as_json),
+        target=None if target is None else read_raw(target),
+        target_distance=target_distance,
+    )
+    calibration.save(output)
+    if as_json:
+        typer.echo(json.dumps({"file": str(output), **calibration.provenance}))
+        return
+    pixels = calibration.pixels
+    assert pixels is not None
+    typer.echo(
+        f"{output}: {calibration.filters} filters, {len(calibration.wavelength)} bands, "
+        f"{len(calibration.angle)} field angles; {pixels.gain:.2f} e-/DN, read noise "
+        f"{pixels.read_noise:.1f} e-, {calibration.provenance['bad_pixels']} bad pixels"
+    )
+
+
+def reconstruct(
+    raw: Annotated[list[Path], typer.Argument(help="Raw frames.")],
+    calibration: Annotated[Path, typer.Option(help="Of the camera, .nc.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Cube (.nc, .hdr, .tiff, .zarr), or a folder.")
+    ],
+    model: Annotated[str, typer.Option(help="A name of `squilla models`, or a file.")] = "ridge",
+    distance: Annotated[
+        float | None, typer.Option(help="Of the scene, mm; default: found from it.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Turn raw frames into hyperspectral cubes.
+
+    Example: squilla reconstruct raw.tiff --calibration camera.nc --model ridge -o cube.nc
+    """
+    from rich.progress import track
+
+    from squilla.calibration.alignment import measure
+    from squilla.calibration.store import load_calibration
+    from squilla.files.cube import save
+    from squilla.files.raw import read_raw
+    from squilla.reconstruction.reconstructor import load_model
+
+    many = len(raw) > 1
+    if many and not output.is_dir():
+        raise InputError(f"For several raw frames {output} must be an existing folder.")
+    camera = load_calibration(calibration)
+    reconstructor = load_model(model, camera)
+    written = []
+    for path in track(raw, "frames", disable=as_json or not many):
+        measurement = measure(read_raw(path), camera, distance=distance)
+        target = output / f"{path.stem}.nc" if many else output
+        save(reconstructor.reconstruct(measurement), target)
+        written.append({"file": str(target), **measurement.provenance})
+    if as_json:
+        typer.echo(json.dumps(written))
+        return
+    for one in written:
+        typer.echo(
+            f"{one['file']}: {one['snr']:.1f} dB, plane at {one['distance']:.0f} mm "
+            f"({one['alignment']}, agreement {one['alignment_score']:.2f})"
+        )
+
+
+def evaluate(
+    cube: Annotated[Path, typer.Argument(help="Reconstructed cube.")],
+    reference: Annotated[Path, typer.Option(help="Cube of the truth.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    as_json: Json = False,
+) -> None:
+    """Judge a cube against a reference.
+
+    Writes metrics.json and report.html.
+
+    Example: squilla evaluate cube.nc --reference truth.nc -o verdict
+    """
+    from squilla.evaluation.report import Trial, scene_section, write_report
+    from squilla.files.cube import load_cube
+    from squilla.files.disk import replacing
+
+    trial = Trial(cube.stem, load_cube(reference), {"cube": load_cube(cube)})
+    metrics = trial.metrics["cube"]
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"The folder {output} cannot be made: {error.strerror}.") from error
+    with replacing(output / "metrics.json") as temporary:
+        temporary.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+    write_report(output / "report.html", [scene_section(trial)], title=f"{cube.name} judged")
+    if as_json:
+        typer.echo(json.dumps(metrics))
+        return
+    for name, value in metrics.items():
+        typer.echo(f"{name:<10} {value:.6g}")
+
+
+def read_sweep(folder: Path) -> "Iterator[SweepStep]":
+    """Go through the frames that ``sweep.csv`` in a folder lists, one by one."""
+    from squilla.calibration.sensitivity import SweepStep
+    from squilla.files.raw import read_raw
+
+    table = folder / "sweep.csv"
+    try:
+        with table.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(
+            f"{table} cannot be read ({error}); a sweep is a folder of frames with a table "
+            "sweep.csv of file, wavelength, power, bandwidth."
+        ) from error
+    for number, row in enumerate(rows, 2):
+        try:
+            name = row["file"]
+            values = [float(row[key]) for key in ("wavelength", "power", "bandwidth")]
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{table}, line {number}: wanted are file, wavelength, power and bandwidth (nm)."
+            ) from error
+        yield SweepStep(read_raw(folder / name), *values)
+
+
+def read_depth(path: Path, shape: tuple[int, ...]):
+    """Read a depth map, mm, and bring it to the shape of the scene, (y, x) float64."""
+    import numpy as np
+
+    try:
+        if path.suffix.lower() == ".npy":
+            depth = np.load(path, allow_pickle=False)
+        else:
+            import tifffile
+
+            depth = np.asarray(tifffile.imread(path))
+    except Exception as error:  # tifffile and NumPy fail on bad bytes in many ways
+        raise InputError(f"The depth map {path} cannot be read: {error}.") from error
+    if depth.ndim != 2 or depth.dtype.kind not in "uif":
+        raise InputError(f"The depth map {path} must be one picture of distances in mm.")
+    if depth.shape != tuple(shape):
+        from scipy.ndimage import zoom
+
+        depth = np.asarray(
+            zoom(depth.astype(float), np.divide(shape, depth.shape), order=1, grid_mode=True)
+        )
+    return depth.astype(float)

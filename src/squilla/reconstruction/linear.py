@@ -1,0 +1,179 @@
+"""The linear (Wiener) estimator, and the filling of invalid channels, which is the same algebra."""
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from squilla.calibration.calibration import Calibration
+from squilla.errors import InputError
+from squilla.reconstruction.reconstructor import Reconstructor
+from squilla.spectra import broad_spectra, reflectances
+
+SNR = 20.0
+"""Signal-to-noise ratio assumed where none is known, dB: what the thesis found for its camera."""
+
+
+class Ridge(Reconstructor):
+    """The best linear estimator for the broad prior: x = S R' (R S R' + sigma^2 I)^-1 y.
+
+    S is the second moment of the spectra (their mean is not taken off, so that twice the light
+    gives twice the spectrum). In the eigenvectors of R S R' = U L U' the noise of each pixel,
+    sigma^2, only divides by another L + sigma^2, so every pixel is treated by its own. Negative
+    values of the estimate are clipped to zero, which moves every spectrum nearer to the truth or
+    leaves it.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With several field angles, there is one estimator for each and the estimates of a pixel
+        are interpolated in between.
+    moment : Tensor, (K, K), optional
+        Second moment of the spectra; default: that of the broad prior.
+
+    Source: N. Wiener; here with the prior of spectra.broad_spectra.
+    """
+
+    name = "ridge"
+    piece = 8192
+    basis: Tensor
+    power: Tensor
+    gain: Tensor
+
+    def __init__(self, calibration: Calibration, moment: Tensor | None = None):
+        super().__init__(calibration)
+        moment = second_moment(calibration) if moment is None else moment
+        response = calibration.sensitivities.double()
+        response = torch.cat([response, calibration.mean_sensitivity.double()[None]])
+        power, basis = torch.linalg.eigh(response @ moment @ response.mT)  # (A + 1, M), (.., M, M)
+        self.register_buffer("basis", basis.float(), persistent=False)
+        self.register_buffer("power", power.clamp_min(0).float(), persistent=False)
+        self.register_buffer("gain", (basis.mT @ response @ moment).float(), persistent=False)
+
+    def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None) -> Tensor:
+        noise = _noise_to_signal(snr, len(y), y.device)[:, None]
+        if angle is None:
+            power = self.power[-1]
+            return (y @ self.basis[-1] / (power + noise * power.mean())) @ self.gain[-1]
+        weights = self.calibration.angle_weights(angle)
+        # One product for all angles: the components, weighted by each angle, side by side.
+        parts = [
+            weight[:, None] * (y @ basis) / (power + noise * power.mean())
+            for weight, basis, power in zip(weights.T, self.basis, self.power, strict=False)
+        ]
+        return torch.cat(parts, -1) @ self.gain[:-1].flatten(0, 1)
+
+
+def _noise_to_signal(snr: Tensor | None, count: int, device: torch.device) -> Tensor:
+    """Return the ratio of noise to signal power of each pixel, (N,); 20 dB where it is unknown."""
+    if snr is None:
+        return torch.full((count,), 10 ** (-SNR / 10), device=device)
+    # Beyond 90 dB the rounding of float32 is the noise.
+    return 10 ** (-snr.clamp_max(90.0) / 10)
+
+
+def second_moment(calibration: Calibration) -> Tensor:
+    """Return the mean of x x' over 20 000 spectra of the broad prior, (K, K), float64.
+
+    Outside 500-750 nm the prior is stretched; see `within_tables`.
+    """
+    return _second_moment(tuple(calibration.wavelength.tolist()))
+
+
+@lru_cache(maxsize=4)  # every capture with an invalid pixel needs it
+def _second_moment(wavelength: tuple[float, ...]) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    spectra = broad_spectra(20_000, within_tables(np.array(wavelength)), generator=generator)
+    return (spectra.T @ spectra).double() / len(spectra)
+
+
+def within_tables(wavelength: np.ndarray) -> np.ndarray:
+    """Return wavelengths at which natural spectra can be drawn for a band.
+
+    They are the band's own where the measured tables (500-750 nm) cover it. Otherwise the band is
+    mapped onto the tables': a camera of 400-1000 nm meets natural spectra stretched to its band,
+    which are as varied and as smooth, if not its own.
+
+    Parameters
+    ----------
+    wavelength : array, (K,)
+        nm.
+
+    Returns
+    -------
+    array, (K,), nm
+    """
+    known = reflectances().wavelength
+    if known[0] - 1e-6 <= wavelength[0] and wavelength[-1] <= known[-1] + 1e-6:
+        return wavelength
+    share = (wavelength - wavelength[0]) / max(np.ptp(wavelength), 1e-9)
+    return known[0] + share * np.ptp(known)
+
+
+def complete(
+    y: Tensor,
+    valid: Tensor,
+    calibration: Calibration,
+    angle: Tensor | None = None,
+    snr: Tensor | None = None,
+) -> Tensor:
+    """Fill the invalid channels of each pixel with their linear estimate from the valid ones.
+
+    To fill and then apply the Wiener estimator gives what the Wiener estimator of the valid
+    channels alone gives; every other reconstructor gets the same filled channels.
+
+    Parameters
+    ----------
+    y : Tensor, (..., M)
+    valid : Tensor, (..., M), bool
+        A channel that is NaN or infinite counts as invalid too.
+    calibration : Calibration
+    angle : Tensor, (...), optional
+        Field angle, rad.
+    snr : Tensor, (...), optional
+        Signal-to-noise ratio of each pixel, dB; default 20.
+
+    Returns
+    -------
+    Tensor, (..., M); NaN where fewer than half of a pixel's channels are valid
+    """
+    valid = torch.as_tensor(valid, dtype=torch.bool)
+    if valid.shape != y.shape:
+        raise InputError(
+            f"The valid mask has the shape {tuple(valid.shape)}, the measurement "
+            f"{tuple(y.shape)}; they must agree."
+        )
+    valid = valid & y.isfinite()
+    enough = valid.sum(-1) >= (y.shape[-1] + 1) // 2
+    partial = enough & ~valid.all(-1)
+    filled = torch.where(enough[..., None], y, torch.nan)
+    if not partial.any():
+        return filled
+    response = calibration.sensitivities.double() if angle is not None else None
+    if response is None:
+        response = calibration.mean_sensitivity.double()[None]
+    covariance = (response @ second_moment(calibration) @ response.mT).float()
+    known = torch.where(valid, y, 0)[partial]
+    noise = _noise_to_signal(None if snr is None else snr[partial], len(known), y.device)
+    weights = torch.ones(len(known), 1)
+    if angle is not None:
+        weights = calibration.angle_weights(angle[partial])
+    parts = [
+        _fill(known[some], valid[partial][some], weights[some], noise[some], covariance)
+        for some in torch.arange(len(known)).split(2048)
+    ]
+    filled[partial] = torch.cat(parts)
+    return filled
+
+
+def _fill(y: Tensor, valid: Tensor, weights: Tensor, noise: Tensor, covariance: Tensor) -> Tensor:
+    """Return y, (N, M), with invalid channels replaced by C_iv C_vv^-1 y_v."""
+    signal = torch.einsum("na,amk->nmk", weights, covariance)
+    power = noise * signal.diagonal(dim1=-2, dim2=-1).mean(-1)
+    one = torch.eye(y.shape[-1])
+    both = valid[:, :, None] & valid[:, None, :]
+    # Rows of invalid channels become those of the identity: they decouple and stay zero.
+    reduced = torch.where(both, signal + power[:, None, None] * one, one)
+    explained = torch.linalg.solve(reduced, y)
+    return torch.where(valid, y, torch.einsum("nmk,nk->nm", signal, explained))

@@ -1,0 +1,400 @@
+"""What every reconstructor is: a torch module from measurements to spectra, made by name."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.resources import files as package_files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from squilla import __version__
+from squilla.calibration.alignment import Measurement
+from squilla.calibration.calibration import Calibration
+from squilla.errors import InputError
+from squilla.files.disk import replacing
+
+if TYPE_CHECKING:
+    from xarray import DataArray
+
+Scale = Literal["consistent", "maximum"]
+
+MODELS: Mapping[str, tuple[str, str, str]] = {
+    "ridge": ("linear", "Ridge", "linear Wiener estimator, one matrix per field angle; at once"),
+    "nnls": ("sparse", "NonNegative", "non-negative least squares over Gaussian line shapes"),
+    "sparse": ("sparse", "Sparse", "non-negative l1 over Gaussian line shapes; best for lines"),
+    "twist": ("sparse", "Twist", "the problem of `sparse` solved by monotone TwIST; slow"),
+    "mlp": ("networks", "MLP", "fully connected network of the BEST camera; 1.1 M weights"),
+    "cnn": ("networks", "CNN", "the thesis' convolutional network; 1.0 M weights"),
+    "rescnn": ("networks", "ResCNN", "convolutional correction of a linear estimate; 3.6 M"),
+    "unet": ("networks", "UNet", "residual U-Net along the wavelengths; 18.5 M weights"),
+    "respecnn": ("networks", "ReSpecNN", "the thesis' proposal; 4.1 M weights"),
+}
+"""Every reconstructor by name: its file in this room, its class, and one line about it."""
+
+TOLERANCE = 0.05
+"""Largest relative RMS change of the sensitivity at which trained weights still hold."""
+
+
+class Reconstructor(nn.Module):
+    """A map from the measurement of a pixel to its spectrum.
+
+    A subclass writes `estimate` for a batch of normalised pixels; this class checks the input,
+    works through it in pieces that fit in the cache, and restores the scale.
+
+    name : how `load_model` calls it.
+    wavelength : (K,) nm.
+    calibration : the camera it reconstructs for.
+    provenance : how its weights came about; plain numbers and strings.
+    """
+
+    name: ClassVar[str]
+    trained: ClassVar[bool] = False
+    """Whether its weights come from training; then its output has a shape but no scale yet."""
+    piece: ClassVar[int] = 2048
+    """Pixels worked on at once."""
+
+    def __init__(self, calibration: Calibration):
+        super().__init__()
+        self.calibration = calibration
+        self.wavelength = calibration.wavelength
+        self.provenance: dict[str, Any] = {}
+
+    def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None) -> Tensor:
+        """Map finite measurements with a maximum of 1, (N, M), to spectra, (N, K).
+
+        angle : (N,) rad, or None for the mean sensitivity.
+        snr : (N,) dB, or None where it is unknown; networks do without.
+        """
+        raise NotImplementedError
+
+    def forward(
+        self,
+        y: Tensor,
+        angle: Tensor | None = None,
+        snr: Tensor | float | None = None,
+        scale: Scale = "consistent",
+    ) -> Tensor:
+        """Reconstruct the spectrum of every pixel.
+
+        Parameters
+        ----------
+        y : Tensor, (..., M)
+            Measurements in the unit of the sensitivity. A pixel with a NaN or infinite channel
+            gives a spectrum of NaN; a pixel without any positive channel gives zero.
+        angle : Tensor, (...), optional
+            Field angle, rad; without it the mean sensitivity is used.
+        snr : Tensor, (...), or float, optional
+            Signal-to-noise ratio of each pixel, dB; without it 20 is assumed where it matters.
+        scale : "consistent" or "maximum"
+            What restores the scale of a network's output: "consistent" multiplies by
+            <y, R x> / <R x, R x>, so that the spectrum explains the measurement; "maximum" by the
+            maximum of y (the thesis' rule). Estimators that solve y = R x have a scale already,
+            and both rules leave it.
+
+        Returns
+        -------
+        Tensor, (..., K), float32, non-negative
+
+        Raises
+        ------
+        InputError
+            If `y` has another number of channels, `angle` or `snr` another shape than the pixels,
+            or `scale` another name.
+        """
+        if scale not in ("consistent", "maximum"):
+            raise InputError(f"There is no scale {scale!r}; there are 'consistent' and 'maximum'.")
+        y, angle, snr = self._accepted(y, angle, snr)
+        pixels = y.shape[:-1]
+        if y.numel() == 0:
+            return y.new_zeros(*pixels, len(self.wavelength))
+        y = y.reshape(-1, y.shape[-1])
+        parts = [
+            self._piece(y[some], None if angle is None else angle.reshape(-1)[some],
+                        None if snr is None else snr.reshape(-1)[some], scale)
+            for some in torch.arange(len(y), device=y.device).split(self.piece)
+        ]  # fmt: skip
+        return torch.cat(parts).reshape(*pixels, len(self.wavelength))
+
+    def _piece(self, y: Tensor, angle: Tensor | None, snr: Tensor | None, scale: Scale) -> Tensor:
+        finite = y.isfinite().all(-1, keepdim=True)
+        y = torch.where(finite, y, 0)
+        peak = y.amax(-1, keepdim=True)
+        lit = peak > 0
+        y = y / torch.where(lit, peak, 1)
+        x = self.estimate(y, angle, snr).clamp_min(0)
+        factor = torch.where(finite, torch.where(lit, peak, 0), torch.nan)
+        if self.trained and scale == "consistent":
+            factor = factor * consistent_scale(y, x, self.calibration, angle)
+        return x * factor
+
+    def _accepted(
+        self, y: Tensor, angle: Tensor | None, snr: Tensor | float | None
+    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        y = torch.as_tensor(y, dtype=torch.float32)
+        if y.ndim == 0 or y.shape[-1] != self.calibration.filters:
+            raise InputError(
+                f"The measurement has the shape {tuple(y.shape)}; its last axis must hold the "
+                f"{self.calibration.filters} channels of the calibration."
+            )
+        if len(self.calibration.angle) == 1:
+            angle = None
+        return y, _per_pixel(angle, y, "field angles"), _per_pixel(snr, y, "SNRs")
+
+    def reconstruct(self, measurement: Measurement, scale: Scale = "consistent") -> "DataArray":
+        """Reconstruct a whole measurement.
+
+        Channels marked invalid are first filled with the linear estimate from the valid channels
+        of the same pixel (`linear.complete`; for "ridge" this is the same as leaving them out). A
+        pixel with fewer than half of its channels valid becomes NaN.
+
+        Parameters
+        ----------
+        measurement : Measurement
+        scale : "consistent" or "maximum"
+            See `forward`.
+
+        Returns
+        -------
+        DataArray, (y, x, wavelength), float32
+            Photon radiance in the unit that the sensitivity implies, with the wavelengths (nm) as
+            coordinate and the origin of the result in `attrs`.
+        """
+        from squilla.reconstruction.linear import complete
+
+        y = torch.as_tensor(measurement.y, dtype=torch.float32)
+        if y.ndim != 3:
+            raise InputError(
+                f"A measurement has the shape (rows, columns, channels), not {tuple(y.shape)}."
+            )
+        y, angle, snr = self._accepted(y, measurement.angle, measurement.snr)
+        y = complete(y, measurement.valid, self.calibration, angle, snr)
+        device = next(iter([*self.parameters(), *self.buffers()]), y).device
+        with torch.inference_mode():
+            cube = self(y.to(device), angle, snr, scale)
+        return self._labelled(cube.cpu().numpy(), measurement, scale)
+
+    def _labelled(self, cube: np.ndarray, measurement: Measurement, scale: Scale) -> "DataArray":
+        from xarray import DataArray
+
+        origin = {
+            "long_name": "photon radiance",
+            "model": self.name,
+            "software": f"squilla {__version__}",
+            "calibration": fingerprint(self.calibration),
+            "scale": scale if self.trained else "solved",
+        }
+        origin |= {f"model_{key}": value for key, value in self.provenance.items()}
+        origin |= {f"measurement_{key}": value for key, value in measurement.provenance.items()}
+        band = {
+            "standard_name": "radiation_wavelength",
+            "long_name": "wavelength",
+            "units": "nm",
+        }
+        return DataArray(
+            cube,
+            dims=("y", "x", "wavelength"),
+            coords={"wavelength": ("wavelength", np.asarray(self.wavelength), band)},
+            name="radiance",
+            attrs={key: value for key, value in origin.items() if value is not None},
+        )
+
+    def save(self, path: str | Path, *, half: bool = False) -> None:
+        """Write the weights to a safetensors file that `load_model` reads.
+
+        The file holds the sensitivity that the weights were trained for, so that they are not used
+        with another camera by mistake.
+
+        Parameters
+        ----------
+        path : path
+            Replaced only when the new file is whole.
+        half : bool
+            Store 16-bit weights: half the size, 0.1 % rounding.
+        """
+        from safetensors.torch import save
+
+        if not self.trained:
+            raise InputError(
+                f"`{self.name}` is computed from the calibration; it has no weights to save."
+            )
+        tensors = {f"weights.{key}": value.cpu() for key, value in self.state_dict().items()}
+        if half:
+            tensors = {
+                key: value.half() if value.is_floating_point() else value
+                for key, value in tensors.items()
+            }
+        tensors["sensitivity"] = self.calibration.mean_sensitivity
+        tensors["wavelength"] = torch.from_numpy(np.asarray(self.wavelength, np.float64))
+        metadata = {
+            "format": "squilla model 1",
+            "name": self.name,
+            "software": f"squilla {__version__}",
+            "calibration": fingerprint(self.calibration),
+            "provenance": json.dumps(self.provenance),
+        }
+        content = save({key: value.contiguous() for key, value in tensors.items()}, metadata)
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
+
+
+def _per_pixel(value: Tensor | float | None, y: Tensor, what: str) -> Tensor | None:
+    """Return one finite number for each pixel of y, (...), or None."""
+    if value is None:
+        return None
+    value = torch.as_tensor(value, dtype=torch.float32, device=y.device)
+    if value.ndim == 0:
+        value = value.expand(y.shape[:-1])
+    if value.shape != y.shape[:-1]:
+        raise InputError(
+            f"The {what} have the shape {tuple(value.shape)}, but the measurement has the pixels "
+            f"{tuple(y.shape[:-1])}; give one per pixel, or one for all."
+        )
+    if not value.isfinite().all():
+        raise InputError(f"The {what} hold NaN or infinite values; give finite numbers.")
+    return value
+
+
+def consistent_scale(
+    y: Tensor, x: Tensor, calibration: Calibration, angle: Tensor | None = None
+) -> Tensor:
+    """Return the factor by which spectra explain their measurements best, <y, Rx> / <Rx, Rx>.
+
+    Parameters
+    ----------
+    y : Tensor, (..., M)
+    x : Tensor, (..., K)
+        Spectra whose shape is known and whose scale is not.
+    calibration : Calibration
+    angle : Tensor, (...), optional
+        Field angle, rad.
+
+    Returns
+    -------
+    Tensor, (..., 1), non-negative; 0 where `x` is zero
+    """
+    expected = calibration.project(x, angle)
+    power = expected.square().sum(-1, keepdim=True)
+    overlap = (y * expected).sum(-1, keepdim=True).clamp_min(0)
+    return overlap / torch.where(power > 0, power, 1)
+
+
+def fingerprint(calibration: Calibration) -> str:
+    """Return twelve hexadecimal digits that tell this sensitivity from every other."""
+    digest = hashlib.sha256()
+    for part in (calibration.wavelength, calibration.angle, calibration.sensitivity):
+        digest.update(np.ascontiguousarray(part, np.float32).tobytes())
+    return digest.hexdigest()[:12]
+
+
+def models() -> dict[str, str]:
+    """Return the names of all reconstructors, each with one line about it."""
+    return {name: description for name, (_, _, description) in MODELS.items()}
+
+
+def model_class(name: str) -> type[Reconstructor]:
+    """Return the class of a reconstructor; each is made as ``model_class(name)(calibration)``."""
+    if name not in MODELS:
+        raise InputError(f"There is no model named {name!r}; there are {', '.join(MODELS)}.")
+    module, attribute, _ = MODELS[name]
+    return getattr(import_module(f"squilla.reconstruction.{module}"), attribute)
+
+
+def load_model(name: str | Path, calibration: Calibration) -> Reconstructor:
+    """Return a reconstructor, ready for this camera.
+
+    Parameters
+    ----------
+    name : str or path
+        A name of `models`, or a file written by `Reconstructor.save`.
+    calibration : Calibration
+        The camera. Weights are accepted when the sensitivity that they were trained for differs
+        from this one, after a common factor, by at most 5 % (relative RMS): a re-measured
+        calibration of the same camera.
+
+    Raises
+    ------
+    InputError
+        If the name is unknown, the file is damaged or foreign, or made for another camera.
+    """
+    if not isinstance(calibration, Calibration):
+        raise InputError(
+            "A model is loaded for a Calibration: read one with load_calibration, or make one "
+            "with Calibration.from_sensitivity."
+        )
+    if isinstance(name, str) and name in MODELS:
+        kind = model_class(name)
+        if not kind.trained:
+            return kind(calibration)
+        path = Path(str(package_files("squilla"))) / "data" / "weights" / f"{name}.safetensors"
+        if not path.is_file():
+            raise InputError(f"No weights ship for `{name}`; train it for your camera first.")
+    else:
+        path = Path(name)
+        if not path.is_file():
+            raise InputError(
+                f"{str(name)!r} is neither a model file nor the name of a model; the names are "
+                f"{', '.join(MODELS)}."
+            )
+    return _read(path, calibration)
+
+
+def _read(path: Path, calibration: Calibration) -> Reconstructor:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path} is not a whole model file ({error}).") from error
+    foreign = InputError(f"{path} is not a model of squilla; make one with train.")
+    name = metadata.get("name", "")
+    if metadata.get("format") != "squilla model 1" or name not in MODELS:
+        raise foreign
+    try:
+        provenance = json.loads(metadata["provenance"])
+        sensitivity, wavelength = tensors.pop("sensitivity"), tensors.pop("wavelength")
+    except (KeyError, ValueError) as error:
+        raise foreign from error
+    _check_camera(path, sensitivity, wavelength.numpy(), calibration)
+    model = model_class(name)(calibration)
+    weights = {key.removeprefix("weights."): value for key, value in tensors.items()}
+    expected = model.state_dict()
+    if not model.trained or {k: v.shape for k, v in weights.items()} != {
+        k: v.shape for k, v in expected.items()
+    }:
+        raise InputError(f"{path} holds other weights than `{name}` has; train it again.")
+    if not all(value.isfinite().all() for value in weights.values()):
+        raise InputError(f"{path} holds weights that are not finite; train it again.")
+    model.load_state_dict(weights)
+    model.provenance = provenance
+    return model.eval()
+
+
+def _check_camera(
+    path: Path, sensitivity: Tensor, wavelength: np.ndarray, calibration: Calibration
+) -> None:
+    """Refuse weights that were trained for another camera than `calibration`."""
+    own = calibration.mean_sensitivity.double()
+    if sensitivity.shape != own.shape or not np.allclose(
+        wavelength, calibration.wavelength, rtol=0, atol=1e-3
+    ):
+        raise InputError(
+            f"{path} was trained for {' channels and '.join(map(str, sensitivity.shape))} bands, "
+            f"{wavelength[0]:g}-{wavelength[-1]:g} nm; the calibration has {own.shape[0]} channels "
+            f"and {own.shape[1]} bands, {calibration.wavelength[0]:g}-"
+            f"{calibration.wavelength[-1]:g} nm. Train a model for this camera."
+        )
+    theirs = sensitivity.double()
+    factor = (own * theirs).sum() / theirs.square().sum().clamp_min(1e-300)
+    difference = float((own - factor * theirs).norm() / own.norm())
+    if not difference <= TOLERANCE:
+        raise InputError(
+            f"{path} was trained for a sensitivity that differs from the calibration's by "
+            f"{difference:.1%} (at most {TOLERANCE:.0%} is allowed). Train a model for this camera."
+        )

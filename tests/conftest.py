@@ -1,0 +1,59 @@
+"""A small camera for the tests: everything the thesis' camera has, on a hundredth of the pixels."""
+
+import numpy as np
+import pytest
+import torch
+
+from squilla.calibration.calibrate import calibrate
+from squilla.calibration.rehearsal import Rehearsal, poster
+from squilla.camera.design import CameraDesign
+from squilla.camera.twin import Camera
+
+
+def small_design(**sections) -> CameraDesign:
+    """Return a 4 x 4 camera with coarse pixels, 51 bands; sections given as dicts of changes."""
+    tree = CameraDesign.load("thesis").model_dump()
+    tree["array"] |= {"rows": 4, "columns": 4}
+    tree["sensor"] |= {"pixel": 7.4, "rows": 480, "columns": 500, "hot_pixels": 2e-5}
+    tree["field"] |= {"size": 60, "reference": 5}
+    tree["band"] |= {"step": 5.0}
+    for name, changes in sections.items():
+        tree[name] = changes if tree[name] is None or changes is None else tree[name] | changes
+    return CameraDesign.model_validate(tree)
+
+
+@pytest.fixture(scope="session")
+def design() -> CameraDesign:
+    return small_design(array={"rotation": 1.2, "offset": (7.3, -11.8), "position_error": 3.0})
+
+
+@pytest.fixture(scope="session")
+def camera(design) -> Camera:
+    return Camera(design)
+
+
+@pytest.fixture(scope="session")
+def calibration(camera):
+    """Learnt from frames alone."""
+    rehearsal = Rehearsal(camera, step=5.0, bandwidth=5.0, distance=300.0)
+    return calibrate(
+        camera.design,
+        dark=rehearsal.dark(),
+        flat=rehearsal.flat(),
+        sweep=rehearsal.sweep(),
+        target=rehearsal.target(),
+        target_distance=300.0,
+    )
+
+
+@pytest.fixture(scope="session")
+def scene(design):
+    """A coloured texture, 90 x 90."""
+    texture = poster(90, design.wavelength, seed=3)
+    tint = np.linspace(0.4, 1, len(design.wavelength))
+    return (texture * tint).astype(np.float32)
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(7)
