@@ -13,11 +13,12 @@ export NUMBA_NUM_THREADS = $(THREADS)
 demo: $(READY)
 	$(BIN)/squilla demo -o demo
 
+# One worker for each core, each with one thread.
 test: $(READY)
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n $(THREADS)
 
 test-all: $(READY)
-	$(BIN)/python -m pytest -m "slow or not slow"
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n $(THREADS) -m "slow or not slow"
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -239,8 +239,8 @@ def test_the_measured_noise_sets_the_linear_estimator(y, angle):
 
 def test_every_pixel_is_treated_by_its_own_noise(solver, y, angle):
     """A batch of mixed noise gives what each pixel gives alone."""
-    snr = torch.linspace(5, 40, len(y))
-    alone = [solver(y[n : n + 1], angle[n : n + 1], float(snr[n])) for n in range(len(y))]
+    y, angle, snr = y[:4], angle[:4], torch.linspace(5, 40, 4)
+    alone = [solver(y[n : n + 1], angle[n : n + 1], float(snr[n])) for n in range(4)]
     torch.testing.assert_close(solver(y, angle, snr), torch.cat(alone), rtol=1e-3, atol=1e-4)
 
 

@@ -256,8 +256,9 @@ def trial(truth, estimates):
     before = np.stack([np.roll(each, 4 * unit, 1) for unit, each in enumerate(after)])
     baseline = np.array([[0.0, 0], [0, 1], [1, 0], [1, 1]])
     lattice = Lattice(
-        (2, 2), 50 + 100 * baseline, baseline, 0, truth.shape[:2], focal=1000.0, pitch=0.7
-    )
+        (2, 2), 50 + 100 * baseline, baseline, 0, truth.shape[:2],
+        focal=1000.0, pitch=400.0, pixel=1.75, usual=300.0,
+    )  # fmt: skip
     frame = np.random.default_rng(5).integers(0, 4096, (200, 200), dtype=np.uint16)
     return Trial(
         "Chart <1>", truth, estimates, {"ridge": 0.0123}, "What it is.", LIGHT, Raw(frame, 12.5),

@@ -193,7 +193,7 @@ def test_every_pixel_uses_the_sensitivity_of_its_angle():
     model = Sparse(camera)
     misfit = {}
     for name, given in (("own", angle), ("none", None)):
-        rest = camera.project(model(y, given), angle) - y
+        rest = camera.project(model(y, given, 60.0), angle) - y
         misfit[name] = float(rest.norm() / y.norm())
     assert misfit["own"] < 0.5 * misfit["none"]
 

@@ -41,7 +41,10 @@ class Lens(_Section):
 
 
 class Filters(_Section):
-    """The filters: a recipe drawn with a seed, or a measured table with an optional n_eff."""
+    """The filters: a recipe drawn with a seed, or a file of stacks or measured responses.
+
+    effective_index : of the films, for the blue shift of measured filters at an angle.
+    """
 
     recipe: Literal["stencil"] | None = None
     seed: int = 0
