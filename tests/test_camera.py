@@ -8,7 +8,7 @@ from xarray import DataArray
 
 from conftest import small_design
 from squilla.camera import lens
-from squilla.camera.design import CameraDesign, Effects
+from squilla.camera.design import CameraDesign, Effects, design_path
 from squilla.camera.twin import Camera
 from squilla.errors import InputError
 
@@ -49,6 +49,15 @@ def test_rotation_turns_the_lattice_about_its_middle():
         ("field", {"reference": 99}, "reference"),
         ("filters", {"recipe": None}, "recipe or a table"),
         ("lens", {"colour": "red"}, "colour"),
+        ("lens", {"focal_length": np.inf}, "finite"),
+        ("array", {"offset": (np.nan, 0.0)}, "finite"),
+        ("filters", {"seed": -1}, "seed"),
+        ("band", {"step": 7.0}, "divide"),
+        ("band", {"step": 600.0}, "divide"),
+        ("band", {"step": 1e-9}, "step"),
+        ("band", {"stop": 400.0}, "above start"),
+        ("sensor", {"black_level": 5000.0}, "black_level"),
+        ("sensor", {"quantum_efficiency": {"wavelength": (400, 900), "value": (0, 2)}}, "0..1"),
     ],
 )
 def test_impossible_designs_are_refused(section, changes, says):
@@ -60,6 +69,10 @@ def test_design_file_errors_are_one_sentence(tmp_path):
     path = tmp_path / "camera.toml"
     path.write_text("name = 'x'\n[array]\nrows = -1\n")
     with pytest.raises(InputError, match=r"camera\.toml"):
+        CameraDesign.load(path)
+    own = design_path("thesis").read_text().replace("size = 250", "size = 400")
+    path.write_text(own)
+    with pytest.raises(InputError, match=r"camera\.toml: the sub-images overlap"):
         CameraDesign.load(path)
     path.write_text("name = [")
     with pytest.raises(InputError, match="cannot be read"):
