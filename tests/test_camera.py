@@ -114,8 +114,8 @@ def test_light_adds_up(camera, scene):
 def test_parallax_is_pitch_times_focal_over_distance(design, distance):
     """A bright dot lies where the thin lens says, in every sub-image."""
     twin = Camera(design)
-    scene = flat_scene(design, 61, 0.0)
-    yy, xx = np.mgrid[:61, :61] - 30.0
+    scene = flat_scene(design, 62, 0.0)
+    yy, xx = np.mgrid[:62, :62] - 30.5
     scene.values += np.exp(-(yy**2 + xx**2) / 8)[..., None].astype(np.float32)
     rate = twin.rate(scene, distance=distance)
     parallax = 700.0 * 2.0 / distance / design.sensor.pixel
@@ -133,6 +133,30 @@ def test_a_plane_depth_map_is_the_plane(camera, scene):
     relief = camera.rate(scene, depth=np.full(scene.shape[:2], 250.0))
     inner = camera._fields(relief) - camera._fields(plane)
     assert np.sqrt((inner**2).mean()) < 0.01 * plane.max()
+
+
+@pytest.mark.parametrize("size", [60, 61, 90, 91, 35])
+def test_the_truth_is_what_the_reference_unit_sees(size):
+    """Sample for sample, whether scene and field are even or odd, larger or smaller."""
+    design = small_design(
+        effects=Effects.none().model_dump(),
+        array={"position_error": 0.0, "pitch": 95 * 7.4, "offset": (0.5, 0.5)},  # on whole pixels
+    )
+    twin = Camera(design)
+    yy, xx = np.mgrid[:size, :size]
+    scene = flat_scene(design, size, 1.0)
+    scene.values *= (2 + np.sin(yy / 3) + np.cos(xx / 4 + yy / 9))[..., None].astype(np.float32)
+    truth = twin.truth(scene).cube.values[..., 0]
+    centre = design.centres[design.field.reference]
+    start = np.rint(centre - (design.field.size - 1) / 2).astype(int)
+    np.testing.assert_allclose(start, centre - (design.field.size - 1) / 2, atol=1e-6)
+    seen = twin.rate(scene)[start[0] : start[0] + 60, start[1] : start[1] + 60]
+    np.testing.assert_allclose(seen / seen.mean(), truth / truth.mean(), atol=0.02)
+
+
+def test_a_stop_narrower_than_the_field_leaves_dark_corners():
+    angles = Camera(small_design(stop={"width": 3.0, "distance": 33.7})).angles
+    assert np.all(np.diff(angles) > 0)
 
 
 def test_near_things_hide_far_ones(design):
