@@ -230,6 +230,22 @@ def test_frames_that_are_no_picture_get_a_verdict(calibration, design, level, sa
         measure(raw, calibration)
 
 
+def test_frames_of_another_depth_are_refused(camera, calibration, scene):
+    """Eight of twelve bits lie below the black level, far from it, and are yet no bright picture."""
+    raw = camera.capture(scene, snr=30, generator=torch.Generator().manual_seed(6))
+    with pytest.raises(InputError, match="bit depth"):
+        measure(Raw(raw.frame >> 4, raw.exposure), calibration)
+
+
+@pytest.mark.parametrize("distance", [0.0, -100.0, np.nan, 0.5])
+def test_impossible_distances_are_refused(camera, calibration, scene, distance):
+    raw = camera.capture(scene, snr=20, generator=torch.Generator().manual_seed(6))
+    with pytest.raises(InputError, match="distance"):
+        measure(raw, calibration, distance=distance)
+    with pytest.raises(InputError, match="distance"):
+        measure(raw, calibration, nearest=distance)
+
+
 def test_frames_of_another_camera_are_refused(camera, calibration, scene):
     raw = camera.capture(scene, snr=20)
     with pytest.raises(InputError, match="different"):
