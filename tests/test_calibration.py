@@ -115,6 +115,20 @@ def test_a_matrix_alone_survives_the_disk(tmp_path):
     assert load_calibration(tmp_path / "matrix.nc").lattice is None
 
 
+def test_one_flipped_bit_anywhere_in_the_tables_is_noticed(tmp_path):
+    random = np.random.default_rng(1)
+    plain = Calibration.from_sensitivity(random.random((36, 251)), np.linspace(500, 750, 251))
+    path = tmp_path / "matrix.nc"
+    plain.save(path)
+    content = bytearray(path.read_bytes())
+    for place in range(len(content) // 3, 2 * len(content) // 3, len(content) // 20):
+        broken = content.copy()
+        broken[place] ^= 1
+        path.write_bytes(broken)
+        with pytest.raises(InputError):
+            load_calibration(path)
+
+
 @pytest.mark.parametrize("spoil", ["cut", "flip", "foreign", "absent"])
 def test_damaged_calibrations_are_refused(calibration, tmp_path, spoil):
     path = tmp_path / "camera.nc"

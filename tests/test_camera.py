@@ -81,6 +81,17 @@ def test_design_file_errors_are_one_sentence(tmp_path):
         CameraDesign.load("nonesuch")
 
 
+def test_a_camera_is_known_by_its_filters_wherever_their_file_lies(tmp_path):
+    table = np.column_stack([np.linspace(400, 800, 81), np.full((81, 16), 0.5)])
+    serials = []
+    for folder, level in (("one", 1.0), ("other", 1.0), ("third", 0.9)):
+        path = tmp_path / folder / "filters.csv"
+        path.parent.mkdir()
+        np.savetxt(path, table * ([1.0] + [level] * 16), delimiter=",")
+        serials.append(Camera(small_design(filters={"recipe": None, "table": path})).serial)
+    assert serials[0] == serials[1] != serials[2]
+
+
 def test_photons_by_hand(camera):
     """Radiance x solid angle x pixel area x band x T Q, with a filter seen without its cone."""
     design = small_design(effects=Effects.none().model_dump())

@@ -148,8 +148,15 @@ class Camera:
 
     @cached_property
     def serial(self) -> str:
-        """Name and short digest of the design: what a real camera's serial number would be."""
-        digest = hashlib.sha256(self.design.model_dump_json(exclude={"effects"}).encode())
+        """Name and short digest of the design: what a real camera's serial number would be.
+
+        A filter table counts by what it holds, not by where it lies.
+        """
+        filters = self.design.filters.model_copy(update={"table": None})
+        figures = self.design.model_copy(update={"filters": filters})
+        digest = hashlib.sha256(figures.model_dump_json(exclude={"effects"}).encode())
+        if self.design.filters.table is not None:
+            digest.update(self.filters.transmittance(self.design.wavelength).numpy().tobytes())
         return f"{self.design.name}-{digest.hexdigest()[:8]}"
 
     # --- taking pictures ----------------------------------------------------------------------

@@ -17,7 +17,7 @@ app = typer.Typer(
 )
 app.command()(steps.demo)
 app.command()(camera.camera)
-app.add_typer(filters.app, name="filters", help="Filter arrays: analyse.")
+app.add_typer(filters.app, name="filters", help="Filter arrays: analyse, design, tolerance.")
 app.command()(steps.simulate)
 app.command()(camera.rehearse)
 app.command()(steps.calibrate)
