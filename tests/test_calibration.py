@@ -1,5 +1,7 @@
 """Closed loops: the twin plants a truth, the calibration finds it in frames alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -283,6 +285,44 @@ def test_unfolding_undoes_the_bandwidth(bandwidth):
     found = unfold(steps, np.full(len(steps), bandwidth), measured, grid)
     truth = np.exp(-((grid - centres[:, None]) ** 2) / 2 / width**2)
     assert rms(found - truth) / rms(truth) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("part", "says"),
+    [
+        ("none", None),
+        ("flat exposure", "exposure"),
+        ("target size", "target has"),
+        ("sweep size", "525 nm has"),
+        ("wavelength", "positive wavelength"),
+        ("power", "positive wavelength"),
+        ("bandwidth", "positive wavelength"),
+    ],
+)
+def test_frames_that_do_not_belong_together_are_refused(design, part, says):
+    rehearsal = Rehearsal(Camera(design), frames=2, step=25.0, bandwidth=25.0)
+    flat, sweep, target = list(rehearsal.flat()), list(rehearsal.sweep()), rehearsal.target()
+    odd = sweep[1].raw
+    if part == "flat exposure":
+        flat[1] = Raw(flat[1].frame, 2 * flat[1].exposure)
+    elif part == "target size":
+        target = Raw(target.frame[:-1], target.exposure)
+    elif part == "sweep size":
+        sweep[1] = replace(sweep[1], raw=Raw(odd.frame[:-1], odd.exposure))
+    elif part != "none":
+        sweep[1] = replace(sweep[1], **{part: np.nan if part == "wavelength" else -1.0})
+
+    def learn(target):
+        return calibrate(
+            design, dark=rehearsal.dark(), flat=flat, sweep=sweep, target=target,
+            target_distance=None if target is None else 300.0,
+        )  # fmt: skip
+
+    if says is None:
+        assert "target_score" not in learn(None).provenance
+        return
+    with pytest.raises(InputError, match=says):
+        learn(target)
 
 
 def test_photon_transfer_finds_gain_and_read_noise():

@@ -70,8 +70,8 @@ def rehearse(
     from squilla.files.disk import replacing
     from squilla.files.raw import write_raw
 
-    if not step > 0 or frames < 1:
-        raise InputError("The step must be positive and the number of frames at least 1.")
+    if not step > 0 or frames < 2:
+        raise InputError("The step must be positive and the number of frames at least 2.")
     twin = Camera(camera)
     rehearsal = Rehearsal(
         twin, seed=seed, frames=frames, step=step, bandwidth=step,

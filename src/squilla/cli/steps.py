@@ -163,14 +163,18 @@ def reconstruct(
     from squilla.reconstruction.reconstructor import load_model
 
     many = len(raw) > 1
-    if many and not output.is_dir():
+    into = output.is_dir() and output.suffix != ".zarr"
+    if many and not into:
         raise InputError(f"For several raw frames {output} must be an existing folder.")
+    names = [path.stem for path in raw]
+    if into and len(set(names)) < len(names):
+        raise InputError("Two raw frames have the same name; their cubes would be one file.")
     camera = load_calibration(calibration)
     reconstructor = load_model(model, camera)
     written = []
     for path in track(raw, "frames", disable=as_json or not many):
         measurement = measure(read_raw(path), camera, distance=distance)
-        target = output / f"{path.stem}.nc" if many else output
+        target = output / f"{path.stem}.nc" if into else output
         save(reconstructor.reconstruct(measurement), target)
         written.append({"file": str(target), **measurement.provenance})
     if as_json:
