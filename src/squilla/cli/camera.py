@@ -56,7 +56,7 @@ def rehearse(
     frames: Annotated[int, typer.Option(help="Darks and flats of each exposure.")] = 8,
     distance: Annotated[float, typer.Option(help="Of the poster, mm.")] = 300.0,
     power_error: Annotated[float, typer.Option(help="Of the reference detector, relative.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of all noise.")] = 0,
 ) -> None:
     """Let the twin take all calibration frames that `squilla calibrate` wants.
 

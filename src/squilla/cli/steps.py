@@ -21,7 +21,7 @@ def demo(
     camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
     snr: Annotated[float, typer.Option(help="Of the captures, dB.")] = 20.0,
     distance: Annotated[float, typer.Option(help="Of the scenes, mm.")] = 300.0,
-    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of all noise.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Send three scenes through the camera and back, and write a report.
@@ -57,7 +57,7 @@ def simulate(
     depth: Annotated[Path | None, typer.Option(help="Depth map, mm: .npy or .tiff.")] = None,
     snr: Annotated[float | None, typer.Option(help="Wanted, dB.")] = None,
     exposure: Annotated[float | None, typer.Option(help="ms, instead of an SNR.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of the noise.")] = 0,
     truth: Annotated[
         Path | None, typer.Option(help="Also write what a perfect camera would see.")
     ] = None,
