@@ -379,7 +379,7 @@ def main(folder: Path) -> None:
     }
     text = report(searches, table, curves, tilted, coated)
     (folder / "README.md").write_text(text, encoding="utf-8")
-    log.info("written %s", folder / "README.md")
+    log.info("written README.md")
 
 
 if __name__ == "__main__":

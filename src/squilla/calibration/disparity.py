@@ -38,7 +38,7 @@ def edges(
     """
     for smooth in _SMOOTHING:
         bell, slope = _derivative(smooth)
-        across, down = np.empty((2, *images.shape), np.float32)
+        across, down = np.empty_like(images), np.empty_like(images)
         _gradient(images, bell, slope, across, down)
         if noise is None:
             break

@@ -39,7 +39,10 @@ class Recipe(Protocol):
         ...
 
     def masks(self, count: int, generator: Generator) -> Tensor | None:
-        """Draw ways to make one filter, (count, L) bool; None where there is nothing to choose."""
+        """Draw ways to make one filter, (count, L) bool; None where there is nothing to choose.
+
+        There is only where all filters share their thicknesses.
+        """
         ...
 
 
@@ -58,7 +61,7 @@ class Search:
     merit : its figure.
     first : the best of the arrays drawn at random.
     drawn : (N,) merits of the arrays drawn at random.
-    history : one step for each array drawn, exchange of masks, and refinement, in order.
+    history : one step for each array drawn and each round of improvement, in order.
     """
 
     array: FilterArray
@@ -137,13 +140,14 @@ def optimise(
         few = [recipe.draw(generator) for _ in range(min(BATCH, draws - first))]
         arrays += few
         drawn.append(merit(together(few).transmittance(wavelength)).detach())
-        for done, found in enumerate(drawn[-1].tolist(), first + 1):
-            note("draw", done, draws, found)
+        for done, value in enumerate(drawn[-1].tolist(), first + 1):
+            note("draw", done, draws, value)
     drawn = torch.cat(drawn)
 
     chosen = drawn.argsort()[:starts].tolist()
-    found = [(float(drawn[i]), arrays[i]) for i in chosen]
-    for start, (value, array) in enumerate(found):
+    found = []
+    for start, draw in enumerate(chosen):
+        array, value = arrays[draw], float(drawn[draw])
         for turn in range(rounds):
             before = value
             array = exchange(recipe, array, merit, wavelength, generator)
@@ -151,7 +155,7 @@ def optimise(
             note("improve", start * rounds + turn + 1, starts * rounds, value)
             if value > 0.999 * before:
                 break
-        found[start] = (value, array)
+        found.append((value, array))
     value, array = min(found, key=lambda pair: pair[0])
     return Search(array, value, arrays[chosen[0]], drawn, history)
 

@@ -110,7 +110,7 @@ def reflectance(
 def _solve(
     index, thickness, wavelength, layers, substrate, ambient, angle, polarization
 ) -> tuple[Tensor, Tensor]:
-    """Return transmittance and reflectance; inside, arrays end in (polarization, angle, K)."""
+    """Return transmittance and reflectance, a few angles at a time."""
     thickness = torch.as_tensor(thickness, dtype=torch.float64)
     device = thickness.device
     index, substrate, ambient = (
@@ -142,7 +142,10 @@ def _solve(
 def _waves(
     index, thickness, wavelength, layers, substrate, ambient, angle, polarization
 ) -> tuple[Tensor, Tensor]:
-    """Return transmittance and reflectance, (..., A, K), for the angles (A,)."""
+    """Return transmittance and reflectance, (..., A, K), for the angles (A,).
+
+    Inside, arrays end in (polarization, angle, K).
+    """
     wave_number = 2 * torch.pi / wavelength
     along = (ambient.real * angle.sin()[:, None]).square()  # of the wave vector over k0, squared
 

@@ -1,0 +1,46 @@
+"""The main job end to end, on the small camera."""
+
+import json
+
+import pytest
+import rasterio
+import xarray as xr
+
+from squilla.camera.design import design_path
+from squilla.demo import demo
+from squilla.errors import InputError
+from test_cli import SMALL
+
+
+def test_demo_writes_everything(tmp_path):
+    text = design_path("thesis").read_text()
+    for old, new in SMALL.items():
+        text = text.replace(old, new)
+    (tmp_path / "small.toml").write_text(text)
+    out = tmp_path / "demo"
+    metrics = demo(
+        out,
+        camera=tmp_path / "small.toml",
+        scenes=["chart", "corn-kernel"],
+        models=["ridge", "sparse"],
+        snr=30,
+    )
+    assert metrics == json.loads((out / "metrics.json").read_text())
+    assert set(metrics) == {"chart", "corn-kernel"}
+    for judged in metrics.values():
+        assert judged["alignment_rms_px"] < 0.2
+        assert {"mse", "rmse", "sam_deg", "psnr_db", "seconds"} <= set(judged["ridge"])
+    assert metrics["chart"]["ridge"]["colours_mse"] < 0.02
+    for name in ("raw.tiff", "calibration.nc", "report.html"):
+        assert (out / name).stat().st_size > 0
+    cube = xr.load_dataarray(out / "chart-ridge.nc")
+    assert (cube.wavelength.values[0], cube.wavelength.attrs["units"]) == (500, "nm")
+    with rasterio.open(out / "chart-ridge.img") as envi:
+        assert envi.count == 51
+        assert float(envi.tags(1)["wavelength"]) == 500
+
+
+def test_demo_needs_a_place(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be made"):
+        demo(tmp_path / "file" / "demo")
