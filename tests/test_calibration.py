@@ -1,5 +1,7 @@
 """Closed loops: the twin plants a truth, the calibration finds it in frames alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -114,6 +116,20 @@ def test_a_matrix_alone_survives_the_disk(tmp_path):
     plain = Calibration.from_sensitivity(np.ones((4, 7)), np.linspace(400, 700, 7))
     plain.save(tmp_path / "matrix.nc")
     assert load_calibration(tmp_path / "matrix.nc").lattice is None
+
+
+def test_one_flipped_bit_anywhere_in_the_tables_is_noticed(tmp_path):
+    random = np.random.default_rng(1)
+    plain = Calibration.from_sensitivity(random.random((36, 251)), np.linspace(500, 750, 251))
+    path = tmp_path / "matrix.nc"
+    plain.save(path)
+    content = bytearray(path.read_bytes())
+    for place in range(len(content) // 3, 2 * len(content) // 3, len(content) // 20):
+        broken = content.copy()
+        broken[place] ^= 1
+        path.write_bytes(broken)
+        with pytest.raises(InputError):
+            load_calibration(path)
 
 
 @pytest.mark.parametrize("spoil", ["cut", "flip", "foreign", "absent"])
@@ -231,6 +247,22 @@ def test_frames_that_are_no_picture_get_a_verdict(calibration, design, level, sa
         measure(raw, calibration)
 
 
+def test_frames_of_another_depth_are_refused(camera, calibration, scene):
+    """Eight of twelve bits lie below the black level, far from it, and are yet no bright picture."""
+    raw = camera.capture(scene, snr=30, generator=torch.Generator().manual_seed(6))
+    with pytest.raises(InputError, match="bit depth"):
+        measure(Raw(raw.frame >> 4, raw.exposure), calibration)
+
+
+@pytest.mark.parametrize("distance", [0.0, -100.0, np.nan, 0.5])
+def test_impossible_distances_are_refused(camera, calibration, scene, distance):
+    raw = camera.capture(scene, snr=20, generator=torch.Generator().manual_seed(6))
+    with pytest.raises(InputError, match="distance"):
+        measure(raw, calibration, distance=distance)
+    with pytest.raises(InputError, match="distance"):
+        measure(raw, calibration, nearest=distance)
+
+
 def test_frames_of_another_camera_are_refused(camera, calibration, scene):
     raw = camera.capture(scene, snr=20)
     with pytest.raises(InputError, match="different"):
@@ -254,6 +286,44 @@ def test_unfolding_undoes_the_bandwidth(bandwidth):
     found = unfold(steps, np.full(len(steps), bandwidth), measured, grid)
     truth = np.exp(-((grid - centres[:, None]) ** 2) / 2 / width**2)
     assert rms(found - truth) / rms(truth) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("part", "says"),
+    [
+        ("none", None),
+        ("flat exposure", "exposure"),
+        ("target size", "target has"),
+        ("sweep size", "525 nm has"),
+        ("wavelength", "positive wavelength"),
+        ("power", "positive wavelength"),
+        ("bandwidth", "positive wavelength"),
+    ],
+)
+def test_frames_that_do_not_belong_together_are_refused(design, part, says):
+    rehearsal = Rehearsal(Camera(design), frames=2, step=25.0, bandwidth=25.0)
+    flat, sweep, target = list(rehearsal.flat()), list(rehearsal.sweep()), rehearsal.target()
+    odd = sweep[1].raw
+    if part == "flat exposure":
+        flat[1] = Raw(flat[1].frame, 2 * flat[1].exposure)
+    elif part == "target size":
+        target = Raw(target.frame[:-1], target.exposure)
+    elif part == "sweep size":
+        sweep[1] = replace(sweep[1], raw=Raw(odd.frame[:-1], odd.exposure))
+    elif part != "none":
+        sweep[1] = replace(sweep[1], **{part: np.nan if part == "wavelength" else -1.0})
+
+    def learn(target):
+        return calibrate(
+            design, dark=rehearsal.dark(), flat=flat, sweep=sweep, target=target,
+            target_distance=None if target is None else 300.0,
+        )  # fmt: skip
+
+    if says is None:
+        assert "target_score" not in learn(None).provenance
+        return
+    with pytest.raises(InputError, match=says):
+        learn(target)
 
 
 def test_photon_transfer_finds_gain_and_read_noise():

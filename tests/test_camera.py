@@ -8,7 +8,7 @@ from xarray import DataArray
 
 from conftest import small_design
 from squilla.camera import lens
-from squilla.camera.design import CameraDesign, Effects
+from squilla.camera.design import CameraDesign, Effects, design_path
 from squilla.camera.twin import Camera
 from squilla.errors import InputError
 
@@ -49,6 +49,15 @@ def test_rotation_turns_the_lattice_about_its_middle():
         ("field", {"reference": 99}, "reference"),
         ("filters", {"recipe": None}, "recipe or a table"),
         ("lens", {"colour": "red"}, "colour"),
+        ("lens", {"focal_length": np.inf}, "finite"),
+        ("array", {"offset": (np.nan, 0.0)}, "finite"),
+        ("filters", {"seed": -1}, "seed"),
+        ("band", {"step": 7.0}, "divide"),
+        ("band", {"step": 600.0}, "divide"),
+        ("band", {"step": 1e-9}, "step"),
+        ("band", {"stop": 400.0}, "above start"),
+        ("sensor", {"black_level": 5000.0}, "black_level"),
+        ("sensor", {"quantum_efficiency": {"wavelength": (400, 900), "value": (0, 2)}}, "0..1"),
     ],
 )
 def test_impossible_designs_are_refused(section, changes, says):
@@ -61,11 +70,26 @@ def test_design_file_errors_are_one_sentence(tmp_path):
     path.write_text("name = 'x'\n[array]\nrows = -1\n")
     with pytest.raises(InputError, match=r"camera\.toml"):
         CameraDesign.load(path)
+    own = design_path("thesis").read_text().replace("size = 250", "size = 400")
+    path.write_text(own)
+    with pytest.raises(InputError, match=r"camera\.toml: the sub-images overlap"):
+        CameraDesign.load(path)
     path.write_text("name = [")
     with pytest.raises(InputError, match="cannot be read"):
         CameraDesign.load(path)
     with pytest.raises(InputError, match="no camera design"):
         CameraDesign.load("nonesuch")
+
+
+def test_a_camera_is_known_by_its_filters_wherever_their_file_lies(tmp_path):
+    table = np.column_stack([np.linspace(400, 800, 81), np.full((81, 16), 0.5)])
+    serials = []
+    for folder, level in (("one", 1.0), ("other", 1.0), ("third", 0.9)):
+        path = tmp_path / folder / "filters.csv"
+        path.parent.mkdir()
+        np.savetxt(path, table * ([1.0] + [level] * 16), delimiter=",")
+        serials.append(Camera(small_design(filters={"recipe": None, "table": path})).serial)
+    assert serials[0] == serials[1] != serials[2]
 
 
 def test_photons_by_hand(camera):
@@ -101,8 +125,8 @@ def test_light_adds_up(camera, scene):
 def test_parallax_is_pitch_times_focal_over_distance(design, distance):
     """A bright dot lies where the thin lens says, in every sub-image."""
     twin = Camera(design)
-    scene = flat_scene(design, 61, 0.0)
-    yy, xx = np.mgrid[:61, :61] - 30.0
+    scene = flat_scene(design, 62, 0.0)
+    yy, xx = np.mgrid[:62, :62] - 30.5
     scene.values += np.exp(-(yy**2 + xx**2) / 8)[..., None].astype(np.float32)
     rate = twin.rate(scene, distance=distance)
     parallax = 700.0 * 2.0 / distance / design.sensor.pixel
@@ -120,6 +144,30 @@ def test_a_plane_depth_map_is_the_plane(camera, scene):
     relief = camera.rate(scene, depth=np.full(scene.shape[:2], 250.0))
     inner = camera._fields(relief) - camera._fields(plane)
     assert np.sqrt((inner**2).mean()) < 0.01 * plane.max()
+
+
+@pytest.mark.parametrize("size", [60, 61, 90, 91, 35])
+def test_the_truth_is_what_the_reference_unit_sees(size):
+    """Sample for sample, whether scene and field are even or odd, larger or smaller."""
+    design = small_design(
+        effects=Effects.none().model_dump(),
+        array={"position_error": 0.0, "pitch": 95 * 7.4, "offset": (0.5, 0.5)},  # on whole pixels
+    )
+    twin = Camera(design)
+    yy, xx = np.mgrid[:size, :size]
+    scene = flat_scene(design, size, 1.0)
+    scene.values *= (2 + np.sin(yy / 3) + np.cos(xx / 4 + yy / 9))[..., None].astype(np.float32)
+    truth = twin.truth(scene).cube.values[..., 0]
+    centre = design.centres[design.field.reference]
+    start = np.rint(centre - (design.field.size - 1) / 2).astype(int)
+    np.testing.assert_allclose(start, centre - (design.field.size - 1) / 2, atol=1e-6)
+    seen = twin.rate(scene)[start[0] : start[0] + 60, start[1] : start[1] + 60]
+    np.testing.assert_allclose(seen / seen.mean(), truth / truth.mean(), atol=0.02)
+
+
+def test_a_stop_narrower_than_the_field_leaves_dark_corners():
+    angles = Camera(small_design(stop={"width": 3.0, "distance": 33.7})).angles
+    assert np.all(np.diff(angles) > 0)
 
 
 def test_near_things_hide_far_ones(design):

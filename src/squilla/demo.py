@@ -154,8 +154,8 @@ def _calibrate(twin: Camera, seed: int, progress: Progress) -> Calibration:
 
     def ticking(frames: Iterable[T]) -> Iterator[T]:
         for frame in frames:
-            yield frame
             progress.advance(task)
+            yield frame
 
     return calibrate(
         twin.design,

@@ -64,12 +64,19 @@ def measure(
     Raises
     ------
     InputError
-        If the calibration is of another camera or knows no geometry, or if the frame is dark or
-        saturated.
+        If the calibration is of another camera or knows no geometry, if the frame is dark or
+        saturated, or if a distance is so short that sub-images would shift by a whole pitch.
     """
     lattice, pixels = _fitting(raw, calibration)
+    shortest = lattice.distance(lattice.pitch)
+    for given in (nearest, distance):
+        if given is not None and not given > shortest:
+            raise InputError(
+                f"The distance must be a number of mm above {shortest:g}, not {given:g}."
+            )
     farthest = float(np.abs(lattice.baseline).max())
-    margin = int(np.ceil(lattice.disparity(min(nearest, distance or nearest)) * farthest)) + _TAPS
+    closest = nearest if distance is None else distance
+    margin = int(np.ceil(lattice.disparity(closest) * farthest)) + _TAPS
     views = sub_images(raw, lattice, pixels, margin)
     snr = _judge(views, raw, pixels)
     score = 1.0
@@ -227,6 +234,11 @@ def _judge(views: SubImages, raw: Raw, pixels: Pixels) -> float:
         )
     good = _inner(views.image, views.margin)[~_inner(views.bad, views.margin)]
     noise = float(_noise_variance(views, pixels).mean())
+    if len(good) and float(good.mean()) < -max(2.0, np.sqrt(noise)):
+        raise InputError(
+            f"The frame lies {-float(good.mean()):.0f} DN below the calibrated dark level: it has "
+            "another bit depth or black level than the calibration's frames."
+        )
     power = float(good.square().mean()) - noise if len(good) else 0.0
     if power <= noise:
         raise InputError(

@@ -60,13 +60,16 @@ def calibrate(
     lattice = lattice_from_flat(light, design)
     if np.mean(windows(flats.mean, lattice, 0)[1] >= saturation) > 1e-3:
         raise InputError("The flat frames are saturated; shorten their exposure.")
-    score = float("nan")
+    aligned = {}
     if target is not None:
         if target_distance is None or not target_distance > 0:
             raise InputError("Give the distance of the target in mm.")
+        if target.frame.shape != light.shape:
+            raise InputError(f"The target has {target.frame.shape} px, the flats {light.shape}.")
         share = np.where(light > 0, light / max(float(np.percentile(light, 99)), 1e-9), 1.0)
         corrected = (target.frame - darks.at(target.exposure)) / np.maximum(share, 0.02)
         lattice, score = refine_with_target(corrected, lattice, target_distance)
+        aligned = {"target_distance": target_distance, "target_score": score}
     lit = _lit(light, lattice)
     gain, read_noise = noise_of(darks.shortest, flats, lit)
 
@@ -93,8 +96,7 @@ def calibrate(
             "design": design.name,
             "camera": flats.camera,
             "sweep_steps": len(wavelength),
-            "target_distance": target_distance or 0.0,
-            "target_score": score,
+            **aligned,
             "bad_pixels": int((~windows(valid, lattice, 0)[1]).sum()),
         },
     )

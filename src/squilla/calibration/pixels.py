@@ -17,7 +17,7 @@ class Stack:
 
     mean : (rows, columns) float32, DN.
     variance : (rows, columns) float32, DN^2, from frame to frame; None for one frame.
-    exposure : ms, of the last frame; None if unknown.
+    exposure : ms; None if unknown.
     camera : as the frames name it.
     """
 
@@ -33,23 +33,28 @@ class Stack:
         Raises
         ------
         InputError
-            If there is no frame, or they differ in size.
+            If there is no frame, or they differ in size or exposure.
         """
         count, first, exposure, camera = 0, None, None, ""
         total = squares = np.zeros((0, 0), np.float32)
         for raw in raws:
             if first is None:  # what is summed is the small difference to it: float32 is enough
-                first = raw.frame
+                first, exposure = raw.frame, raw.exposure
                 total, squares = np.zeros((2, *first.shape), np.float32)
             if raw.frame.shape != first.shape:
                 raise InputError(
                     f"The {kind} frames differ in size: {first.shape} and {raw.frame.shape}."
                 )
+            if raw.exposure != exposure:
+                raise InputError(
+                    f"The {kind} frames differ in exposure, {exposure} and {raw.exposure} ms; give "
+                    "only those of one."
+                )
             _accumulate(raw.frame, first, total, squares)
-            count, exposure = count + 1, raw.exposure
+            count += 1
             camera = str(raw.metadata.get("camera", ""))
         if first is None:
-            raise InputError(f"There is no {kind} frame; at least one is needed, better eight.")
+            raise InputError(f"There is no {kind} frame; at least two are needed, better eight.")
         mean = total / count
         variance = None
         if count > 1:
@@ -102,7 +107,7 @@ def _grouped(raws: Iterable[Raw]) -> dict[float, Stack]:
             raise InputError(f"The dark frames of {exposure:g} ms must follow each other.")
         stacks[exposure] = Stack.of(group, "dark")
     if not stacks:
-        raise InputError("There is no dark frame; at least one is needed, better eight.")
+        raise InputError("There is no dark frame; at least two are needed, better eight.")
     return stacks
 
 

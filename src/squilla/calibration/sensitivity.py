@@ -132,9 +132,16 @@ def sweep_responses(
     """
     rows = []
     for step in steps:
-        if not step.power > 0 or step.raw.exposure is None:
+        figures = (step.wavelength, step.power, step.bandwidth, step.raw.exposure or 0.0)
+        if not (np.isfinite(figures).all() and min(figures) > 0):
             raise InputError(
-                f"The sweep frame at {step.wavelength:g} nm needs a positive power and an exposure."
+                f"The sweep frame at {step.wavelength:g} nm needs a positive wavelength, power, "
+                "bandwidth and exposure."
+            )
+        if step.raw.frame.shape != flat.shape:
+            raise InputError(
+                f"The sweep frame at {step.wavelength:g} nm has {step.raw.frame.shape} px, the "
+                f"flats {flat.shape}; take all with one camera."
             )
         if np.mean(step.raw.frame >= saturation) > 1e-3:
             raise InputError(

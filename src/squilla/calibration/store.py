@@ -17,8 +17,8 @@ _FRAMES = ("bias", "dark_rate", "flat")
 def save_calibration(calibration: Calibration, path: str | Path) -> None:
     """Write a calibration, whole or not at all.
 
-    The frames (bias, dark rate, flat) are packed to 16 bits over their range, every block with a
-    checksum; everything else is kept to the bit.
+    The frames (bias, dark rate, flat) are packed to 16 bits over their range; everything else is
+    kept to the bit. Every block of every table has a checksum.
 
     Parameters
     ----------
@@ -51,18 +51,16 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
         numbers = ("reference", "focal", "pitch", "pixel", "usual")
         attributes |= {f"lattice_{name}": getattr(lattice, name) for name in numbers}
         attributes |= {"lattice_shape": list(lattice.shape), "lattice_field": list(lattice.field)}
-    encoding = {}
+    checked = {"fletcher32": True, "zlib": True, "complevel": 1, "shuffle": True}
     if pixels is not None:
         for name in _FRAMES:
             variables[name] = (("row", "column"), *_packed(getattr(pixels, name)))
         variables["valid"] = (("row", "column"), pixels.valid.astype(np.uint8))
-        checked = {"zlib": True, "complevel": 1, "shuffle": True, "fletcher32": True}
-        encoding = dict.fromkeys((*_FRAMES, "valid"), checked)
         for name in ("saturation", "gain", "read_noise"):
             attributes[f"pixels_{name}"] = float(getattr(pixels, name))
     dataset = xr.Dataset(variables, attrs=attributes)
     with replacing(path) as temporary:
-        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=dict.fromkeys(variables, checked))
 
 
 def load_calibration(path: str | Path) -> Calibration:

@@ -14,7 +14,9 @@ from squilla.spectra import grid
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, ignored_types=(cached_property,)
+    )
 
 
 class Array(_Section):
@@ -26,7 +28,7 @@ class Array(_Section):
     rotation: float = Field(0.0, ge=-5, le=5)
     offset: tuple[float, float] = (0.0, 0.0)
     position_error: float = Field(0.0, ge=0)
-    seed: int = 0
+    seed: int = Field(0, ge=0)
 
 
 class Lens(_Section):
@@ -47,7 +49,7 @@ class Filters(_Section):
     """
 
     recipe: Literal["stencil"] | None = None
-    seed: int = 0
+    seed: int = Field(0, ge=0)
     table: Path | None = None
     effective_index: float | None = Field(None, gt=1)
 
@@ -93,8 +95,17 @@ class Sensor(_Section):
     black_level: float = Field(0.0, ge=0)
     prnu: float = Field(0.0, ge=0, lt=0.5)
     hot_pixels: float = Field(0.0, ge=0, lt=0.1)
-    seed: int = 0
+    seed: int = Field(0, ge=0)
     quantum_efficiency: Spectrum
+
+    @model_validator(mode="after")
+    def _possible(self):
+        if self.black_level >= 2**self.bits - 1:
+            raise ValueError("black_level must lie below the top of the scale, 2^bits - 1")
+        efficiency = self.quantum_efficiency.value
+        if min(efficiency) < 0 or max(efficiency) > 1:
+            raise ValueError("the quantum efficiency must lie within 0..1")
+        return self
 
     @property
     def gain(self) -> float:
@@ -110,11 +121,23 @@ class FieldOfView(_Section):
 
 
 class Band(_Section):
-    """The wavelengths, nm."""
+    """The wavelengths, nm; step must divide the band, for each band holds `step` of the light."""
 
     start: float = Field(gt=0)
     stop: float = Field(gt=0)
-    step: float = Field(gt=0)
+    step: float = Field(ge=0.01)
+
+    @model_validator(mode="after")
+    def _even(self):
+        if self.stop <= self.start:
+            raise ValueError("stop must lie above start")
+        steps = (self.stop - self.start) / self.step
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
+            raise ValueError(
+                f"a step of {self.step:g} nm does not divide the band from {self.start:g} to "
+                f"{self.stop:g} nm"
+            )
+        return self
 
 
 class Light(_Section):
@@ -187,8 +210,10 @@ class CameraDesign(_Section):
             return cls.model_validate(tree)
         except ValidationError as error:
             first = error.errors()[0]
-            place = ".".join(map(str, first["loc"])) or "the whole"
-            raise InputError(f"The camera design {path}: {place}: {first['msg']}.") from error
+            place = ".".join(map(str, first["loc"]))
+            said = first["msg"].removeprefix("Value error, ")
+            about = f"{place}: {said}" if place else said
+            raise InputError(f"The camera design {path}: {about}.") from error
 
     @model_validator(mode="after")
     def _fits(self):
@@ -208,8 +233,6 @@ class CameraDesign(_Section):
                 f"the sub-images leave the sensor: they need {rows} x {columns} px, it has "
                 f"{self.sensor.rows} x {self.sensor.columns}"
             )
-        if self.band.stop <= self.band.start:
-            raise ValueError("band.stop must lie above band.start")
         known = self.sensor.quantum_efficiency.wavelength
         if self.band.start < known[0] or self.band.stop > known[-1]:
             raise ValueError("the quantum efficiency must cover the band")

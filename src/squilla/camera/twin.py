@@ -50,8 +50,9 @@ class Camera:
     -----
     A scene is a DataArray (y, x, wavelength) of relative photon radiance; a value of 1 is
     ``design.light.radiance``. One sample falls on one sensor pixel, the middle of the scene on the
-    axis of the reference unit, in the orientation of the sub-images. Beyond its edge a scene goes
-    on as its mirror image.
+    axis of the reference unit (half a pixel beside it where scene and field are not both even or
+    both odd), in the orientation of the sub-images. Beyond its edge a scene goes on as its mirror
+    image. A scene with depth is blurred as a plane at its median distance.
 
     Filters and blur at a field angle are interpolated between a few angles, linearly in the squared
     angle; the blur over wavelength and angle is a sum of a few separable terms. So one unit's
@@ -88,6 +89,7 @@ class Camera:
         """
         size = np.array([self.design.field.size / np.sqrt(2), self._farthest])
         corner, last = np.arctan(size / self.design.focal) ** 2
+        last = max(last, 1.01 * corner)  # a narrow stop may leave the corners dark
         return np.sqrt([*np.linspace(0, corner, 4), (corner + last) / 2, last])
 
     @property
@@ -146,8 +148,15 @@ class Camera:
 
     @cached_property
     def serial(self) -> str:
-        """Name and short digest of the design: what a real camera's serial number would be."""
-        digest = hashlib.sha256(self.design.model_dump_json(exclude={"effects"}).encode())
+        """Name and short digest of the design: what a real camera's serial number would be.
+
+        A filter table counts by what it holds, not by where it lies.
+        """
+        filters = self.design.filters.model_copy(update={"table": None})
+        figures = self.design.model_copy(update={"filters": filters})
+        digest = hashlib.sha256(figures.model_dump_json(exclude={"effects"}).encode())
+        if self.design.filters.table is not None:
+            digest.update(self.filters.transmittance(self.design.wavelength).numpy().tobytes())
         return f"{self.design.name}-{digest.hexdigest()[:8]}"
 
     # --- taking pictures ----------------------------------------------------------------------
@@ -295,7 +304,9 @@ class Camera:
         middle = float(np.mean(plane))
         on_axis = start - self.design.centres[unit]
         # Scene position of the window's first pixel, and of the first pixel of the canvas around.
-        origin = on_axis - middle * baseline + (np.array(seen.shape[:2]) - 1) / 2
+        field = self.design.field.size
+        centre = [_first(field, length) + (field - 1) / 2 for length in seen.shape[:2]]
+        origin = on_axis - middle * baseline + centre
         first = np.floor(origin).astype(int) - margin
         position = on_axis + first - origin
         canvas = warp.weigh(seen, first, position, self.design.focal, self.angles**2, size)
@@ -409,9 +420,14 @@ def _shift(offset: np.ndarray, size: tuple[int, int]) -> Tensor:
     )
 
 
+def _first(size: int, length: int) -> int:
+    """Return the index at which the middle `size` samples of an axis begin."""
+    return (length - size) // 2
+
+
 def _middle(size: int, length: int) -> np.ndarray:
     """Return the indices of the middle `size` samples of an axis that goes on mirrored."""
-    index = np.rint((length - size) / 2 + np.arange(size)).astype(int) % (2 * length)
+    index = (_first(size, length) + np.arange(size)) % (2 * length)
     return np.where(index < length, index, 2 * length - 1 - index)
 
 

@@ -56,7 +56,7 @@ def rehearse(
     frames: Annotated[int, typer.Option(help="Darks and flats of each exposure.")] = 8,
     distance: Annotated[float, typer.Option(help="Of the poster, mm.")] = 300.0,
     power_error: Annotated[float, typer.Option(help="Of the reference detector, relative.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of all noise.")] = 0,
 ) -> None:
     """Let the twin take all calibration frames that `squilla calibrate` wants.
 
@@ -70,8 +70,8 @@ def rehearse(
     from squilla.files.disk import replacing
     from squilla.files.raw import write_raw
 
-    if not step > 0 or frames < 1:
-        raise InputError("The step must be positive and the number of frames at least 1.")
+    if not step > 0 or frames < 2:
+        raise InputError("The step must be positive and the number of frames at least 2.")
     twin = Camera(camera)
     rehearsal = Rehearsal(
         twin, seed=seed, frames=frames, step=step, bandwidth=step,

@@ -21,7 +21,7 @@ def demo(
     camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
     snr: Annotated[float, typer.Option(help="Of the captures, dB.")] = 20.0,
     distance: Annotated[float, typer.Option(help="Of the scenes, mm.")] = 300.0,
-    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of all noise.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Send three scenes through the camera and back, and write a report.
@@ -57,7 +57,7 @@ def simulate(
     depth: Annotated[Path | None, typer.Option(help="Depth map, mm: .npy or .tiff.")] = None,
     snr: Annotated[float | None, typer.Option(help="Wanted, dB.")] = None,
     exposure: Annotated[float | None, typer.Option(help="ms, instead of an SNR.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of the noise.")] = 0,
     truth: Annotated[
         Path | None, typer.Option(help="Also write what a perfect camera would see.")
     ] = None,
@@ -163,14 +163,18 @@ def reconstruct(
     from squilla.reconstruction.reconstructor import load_model
 
     many = len(raw) > 1
-    if many and not output.is_dir():
+    into = output.is_dir() and output.suffix != ".zarr"
+    if many and not into:
         raise InputError(f"For several raw frames {output} must be an existing folder.")
+    names = [path.stem for path in raw]
+    if into and len(set(names)) < len(names):
+        raise InputError("Two raw frames have the same name; their cubes would be one file.")
     camera = load_calibration(calibration)
     reconstructor = load_model(model, camera)
     written = []
     for path in track(raw, "frames", disable=as_json or not many):
         measurement = measure(read_raw(path), camera, distance=distance)
-        target = output / f"{path.stem}.nc" if many else output
+        target = output / f"{path.stem}.nc" if into else output
         save(reconstructor.reconstruct(measurement), target)
         written.append({"file": str(target), **measurement.provenance})
     if as_json:
