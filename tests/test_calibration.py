@@ -248,7 +248,7 @@ def test_frames_that_are_no_picture_get_a_verdict(calibration, design, level, sa
 
 
 def test_frames_of_another_depth_are_refused(camera, calibration, scene):
-    """Eight of twelve bits lie below the black level, far from it, and are yet no bright picture."""
+    """Eight of twelve bits lie far below the black level, and are yet no bright picture."""
     raw = camera.capture(scene, snr=30, generator=torch.Generator().manual_seed(6))
     with pytest.raises(InputError, match="bit depth"):
         measure(Raw(raw.frame >> 4, raw.exposure), calibration)

@@ -262,7 +262,8 @@ def trial(truth, estimates):
     frame = np.random.default_rng(5).integers(0, 4096, (200, 200), dtype=np.uint16)
     return Trial(
         "Chart <1>", truth, estimates, {"ridge": 0.0123}, "What it is.", LIGHT, Raw(frame, 12.5),
-        lattice, before, after, np.linspace(1.9999, 2.0001, 3600).reshape(truth.shape[:2]), chart_layout(60, 60),
+        lattice, before, after, np.linspace(1.9999, 2.0001, 3600).reshape(60, 60),
+        chart_layout(60, 60),
     )  # fmt: skip
 
 
