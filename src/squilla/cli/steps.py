@@ -245,7 +245,7 @@ def read_sweep(folder: Path) -> "Iterator[SweepStep]":
 
 
 def read_depth(path: Path, shape: tuple[int, ...]):
-    """Read a depth map, mm, and bring it to the shape of the scene, (y, x) float64."""
+    """Read a depth map, mm, and cut and resize it as `fitted` does the scene, (y, x) float64."""
     import numpy as np
 
     try:
@@ -257,12 +257,14 @@ def read_depth(path: Path, shape: tuple[int, ...]):
             depth = np.asarray(tifffile.imread(path))
     except Exception as error:  # tifffile and NumPy fail on bad bytes in many ways
         raise InputError(f"The depth map {path} cannot be read: {error}.") from error
-    if depth.ndim != 2 or depth.dtype.kind not in "uif":
+    if depth.ndim != 2 or depth.size == 0 or depth.dtype.kind not in "uif":
         raise InputError(f"The depth map {path} must be one picture of distances in mm.")
     if depth.shape != tuple(shape):
         from scipy.ndimage import zoom
 
-        depth = np.asarray(
-            zoom(depth.astype(float), np.divide(shape, depth.shape), order=1, grid_mode=True)
-        )
+        side = min(depth.shape)
+        top, left = ((length - side) // 2 for length in depth.shape)
+        square = depth[top : top + side, left : left + side].astype(float)
+        factor = np.divide(shape, side)
+        depth = np.asarray(zoom(square, factor, order=1, mode="nearest", grid_mode=True))
     return depth.astype(float)
