@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from squilla.camera.design import design_path
 from squilla.cli.app import app
-from squilla.cli.steps import read_depth
+from squilla.cli.steps import read_depth, read_sweep
 from squilla.errors import InputError
 
 SMALL = {
@@ -122,6 +122,16 @@ def test_a_depth_map_is_cut_and_resized_as_its_scene_is(tmp_path):
 def test_one_frame_goes_into_a_folder_too(bench, tmp_path):
     run("reconstruct", bench / "raw.tiff", "--calibration", bench / "camera.nc", "-o", tmp_path)
     assert (tmp_path / "raw.nc").is_file()
+
+
+def test_a_sweep_is_doubted_before_any_frame_is_read(tmp_path):
+    for content, says in (
+        ("file,wavelength,power,bandwidth\nnone.tiff,500,1,5\n", "no file"),
+        ("file\nx\n", "line 2"),
+    ):
+        (tmp_path / "sweep.csv").write_text(content)
+        with pytest.raises(InputError, match=says):
+            read_sweep(tmp_path)
 
 
 @pytest.mark.parametrize("seed", ["-1", "99999999999999999999"])

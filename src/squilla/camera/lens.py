@@ -23,7 +23,8 @@ def defocus(design: CameraDesign, angle: np.ndarray, distance: float) -> tuple[n
     Returns
     -------
     sagittal, tangential : array, (A, K)
-        um; positive where the image forms in front of the sensor.
+        um; positive where the image forms in front of the sensor. Without the effect of field
+        curvature ``design.lens.defocus``, which balances it, is left out too.
 
     Source: thin-lens equation with the glass' dispersion; Coddington's equations give the image
     surfaces of a thin lens the curvatures (1 + 1/n)/f and (3 + 1/n)/f.

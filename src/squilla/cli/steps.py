@@ -220,8 +220,9 @@ def evaluate(
 
 
 def read_sweep(folder: Path) -> "Iterator[SweepStep]":
-    """Go through the frames that ``sweep.csv`` in a folder lists, one by one."""
+    """Read ``sweep.csv`` in a folder at once, and return an iterator over the frames it lists."""
     from squilla.calibration.sensitivity import SweepStep
+    from squilla.files.disk import existing
     from squilla.files.raw import read_raw
 
     table = folder / "sweep.csv"
@@ -233,15 +234,17 @@ def read_sweep(folder: Path) -> "Iterator[SweepStep]":
             f"{table} cannot be read ({error}); a sweep is a folder of frames with a table "
             "sweep.csv of file, wavelength, power, bandwidth."
         ) from error
+    listed = []
     for number, row in enumerate(rows, 2):
         try:
-            name = row["file"]
+            path = folder / row["file"]
             values = [float(row[key]) for key in ("wavelength", "power", "bandwidth")]
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"{table}, line {number}: wanted are file, wavelength, power and bandwidth (nm)."
             ) from error
-        yield SweepStep(read_raw(folder / name), *values)
+        listed.append((existing(path), values))
+    return (SweepStep(read_raw(path), *values) for path, values in listed)
 
 
 def read_depth(path: Path, shape: tuple[int, ...]):
