@@ -51,6 +51,14 @@ def test_noise_is_found(calibration, design):
     assert calibration.pixels.read_noise == pytest.approx(design.sensor.read_noise, rel=0.1)
 
 
+def test_the_response_of_every_pixel_is_found(camera, calibration):
+    """What is left of the planted PRNU, 0.5 %, is the noise of eight flats."""
+    response = camera._fields(camera.sensor.response)
+    assert response.std() == pytest.approx(0.005, rel=0.05)
+    found = camera._fields(calibration.pixels.flat)
+    assert np.corrcoef(found.ravel(), response.ravel())[0, 1] > 0.4
+
+
 def test_hot_pixels_are_found(camera, calibration):
     hot = camera.sensor.dark_rate > 10 * np.median(camera.sensor.dark_rate)
     assert hot.any()

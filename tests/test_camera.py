@@ -11,6 +11,7 @@ from squilla.camera import lens
 from squilla.camera.design import CameraDesign, Effects, design_path
 from squilla.camera.twin import Camera
 from squilla.errors import InputError
+from squilla.optics.materials import refractive_index
 
 
 def flat_scene(design, size=90, value=1.0):
@@ -38,6 +39,7 @@ def test_rotation_turns_the_lattice_about_its_middle():
     arm, other = (straight - middle)[3], (turned - middle)[3]
     cosine = arm @ other / np.linalg.norm(arm) / np.linalg.norm(other)
     assert np.rad2deg(np.arccos(cosine)) == pytest.approx(2.0, abs=1e-6)
+    assert turned[3, 0] > turned[0, 0]  # the right end of a row goes down: clockwise as shown
 
 
 @pytest.mark.parametrize(
@@ -255,6 +257,19 @@ def test_transfer_function_without_aberrations_is_the_airy_one():
         np.testing.assert_allclose(transfer[band], airy, atol=0.02)
 
 
+def test_field_curvature_blurs_as_ray_traces_say():
+    """RMS spot radii of the thesis' lens in focus on the axis: 1.1-2.6 px at the edge of the field,
+    2.7-4.3 px in its corner, where the chief ray is inclined by 6.6 and 9.3 degrees."""
+    design = CameraDesign.load("thesis")
+    lens_in_focus = design.lens.model_copy(update={"defocus": 0.0})
+    design = design.model_copy(update={"lens": lens_in_focus})
+    sagittal, tangential = lens.defocus(design, np.deg2rad([6.6, 9.3]), 300.0)
+    axes = np.array([sagittal[:, 100], tangential[:, 100]]) / 8 / design.sensor.pixel
+    edge, corner = np.sqrt((axes**2).sum(0) / 4)  # of an evenly filled ellipse
+    assert 1.1 < edge < 2.6
+    assert 2.7 < corner < 4.3
+
+
 def test_chromatic_focus_is_the_glass():
     """Focus shift f (n0 - n) / (n - 1) for the glass of the design; microns over the band."""
     design = small_design(effects=Effects.none().model_dump() | {"chromatic_focus": True})
@@ -264,6 +279,21 @@ def test_chromatic_focus_is_the_glass():
     # The figures of N-BK7, whose dispersion is close: -20, -9, 0, 7, 13, 17 um.
     got = np.interp([500, 550, 600, 650, 700, 750], design.wavelength, shift)
     np.testing.assert_allclose(got, [-20, -9, 0, 7, 13, 17], atol=2.5)
+
+
+def test_astigmatism_obeys_seidel_and_petzval():
+    """From the Petzval surface, of curvature 1 / (n f), the tangential image lies three times as
+    far as the sagittal; both bend towards the lens, in front of the sensor."""
+    design = small_design(
+        effects=Effects.none().model_dump() | {"field_curvature": True}, lens={"defocus": 0.0}
+    )
+    angle = np.array([0.0, 0.05, 0.1])
+    sagittal, tangential = (focus[:, 0] for focus in lens.defocus(design, angle, 300.0))
+    index = np.real(refractive_index(design.lens.glass, np.array([600.0])))[0]
+    petzval = (2000 * np.tan(angle)) ** 2 / (2 * index * 2000)
+    np.testing.assert_allclose(tangential - petzval, 3 * (sagittal - petzval), atol=1e-9)
+    assert np.all(np.diff(sagittal) > 0)
+    assert np.all(sagittal >= petzval)
 
 
 def test_cone_conserves_light_and_widens(design):
@@ -315,6 +345,8 @@ def test_impossible_captures_are_refused(camera, scene):
         camera.capture(scene)
     with pytest.raises(InputError, match="saturates"):
         camera.capture(scene, snr=60)
+    with pytest.raises(InputError, match="must be a number of dB"):
+        camera.capture(scene, snr=np.nan)
     with pytest.raises(InputError, match="no light"):
         camera.capture(scene * 0, snr=20)
     with pytest.raises(InputError, match="distance"):

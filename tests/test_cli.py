@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from squilla.camera.design import design_path
 from squilla.cli.app import app
+from squilla.cli.steps import read_depth, read_sweep
 from squilla.errors import InputError
 
 SMALL = {
@@ -110,6 +111,38 @@ def test_a_depth_map_moves_things(bench, tmp_path):
     assert json.loads(printed)[0]["distance"] == pytest.approx(150, rel=0.02)
 
 
+def test_a_depth_map_is_cut_and_resized_as_its_scene_is(tmp_path):
+    np.save(tmp_path / "depth.npy", np.tile(np.arange(300.0, 320.0), (10, 1)))
+    depth = read_depth(tmp_path / "depth.npy", (60, 60))
+    # The middle ten columns, one to six pixels, and nothing new beyond the border.
+    expected = np.clip(305 + (np.arange(60) + 0.5) / 6 - 0.5, 305, 314)
+    np.testing.assert_allclose(depth, np.tile(expected, (60, 1)))
+
+
+def test_one_frame_goes_into_a_folder_too(bench, tmp_path):
+    run("reconstruct", bench / "raw.tiff", "--calibration", bench / "camera.nc", "-o", tmp_path)
+    assert (tmp_path / "raw.nc").is_file()
+
+
+def test_a_sweep_is_doubted_before_any_frame_is_read(tmp_path):
+    for content, says in (
+        ("file,wavelength,power,bandwidth\nnone.tiff,500,1,5\n", "no file"),
+        ("file\nx\n", "line 2"),
+    ):
+        (tmp_path / "sweep.csv").write_text(content)
+        with pytest.raises(InputError, match=says):
+            read_sweep(tmp_path)
+
+
+@pytest.mark.parametrize("seed", ["-1", "99999999999999999999"])
+def test_seeds_that_cannot_be_are_refused(tmp_path, seed):
+    result = CliRunner().invoke(
+        app, ["simulate", "chart", "-o", str(tmp_path / "o.tiff"), "--seed", seed]
+    )
+    assert result.exit_code == 2
+    assert "--seed" in result.output
+
+
 def test_the_printed_design_is_a_design(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(run("camera", "thesis", "--toml"))
@@ -139,6 +172,10 @@ BAD = {
     "SNR out of reach": CAPTURE + " --snr 90",
     "too near": CAPTURE + " --distance 2",
     "foreign depth map": CAPTURE + " --depth {b}/small.toml",
+    "empty depth map": CAPTURE + " --depth {t}/empty.npy",
+    "impossible distance": RECONSTRUCT + " {b}/raw.tiff --distance 0",
+    "two cubes of one name": "reconstruct --calibration {b}/camera.nc -o {t} {b}/raw.tiff"
+    " {b}/raw.tiff",
     "foreign raw": RECONSTRUCT + " {b}/small.toml",
     "truncated raw": RECONSTRUCT + " {t}/cut.tiff",
     "wrong size": RECONSTRUCT + " {t}/small.tiff",
@@ -162,6 +199,7 @@ BAD = {
 def test_bad_input_is_one_sentence_and_leaves_nothing(bench, tmp_path, name):
     frame = tifffile.imread(bench / "raw.tiff")
     (tmp_path / "cut.tiff").write_bytes((bench / "raw.tiff").read_bytes()[:5000])
+    np.save(tmp_path / "empty.npy", np.zeros((0, 5)))
     tifffile.imwrite(tmp_path / "small.tiff", frame[:100])
     tifffile.imwrite(tmp_path / "rgb.tiff", np.zeros((480, 500, 3), np.uint8), photometric="rgb")
     tifffile.imwrite(tmp_path / "dark.tiff", np.full_like(frame, 64))

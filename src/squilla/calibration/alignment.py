@@ -105,6 +105,7 @@ def measure(
             "snr": snr,
             "camera": raw.metadata.get("camera", "unknown"),
             "exposure": raw.exposure or 0.0,
+            "unit": "DN/ms" if raw.exposure else "DN, exposure unknown",
             "disparity": disparity,
             "distance": lattice.distance(disparity),
             "alignment": how,

@@ -55,6 +55,10 @@ def calibrate(
             f"The frames have {darks.bias.shape} and {flats.mean.shape} px, the design "
             f"{design.sensor_shape}; take them with the camera of the design."
         )
+    names = {darks.shortest.camera, flats.camera}
+    names |= {str(target.metadata.get("camera", ""))} if target is not None else set()
+    if len(names - {""}) > 1:
+        raise InputError(f"The frames are of different cameras: {sorted(names - {''})}.")
     saturation = 0.98 * (2**design.sensor.bits - 1)
     light = flats.mean - darks.at(flats.exposure)
     lattice = lattice_from_flat(light, design)

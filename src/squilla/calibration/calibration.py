@@ -107,8 +107,12 @@ class Calibration:
             )
         if not np.all(np.isfinite(self.sensitivity)):
             raise InputError("The sensitivity holds NaN or infinite values; repair the table.")
-        if not np.all(np.diff(self.wavelength) > 0):
-            raise InputError("The wavelengths of a calibration must increase.")
+        if not (np.all(np.diff(self.wavelength) > 0) and np.all(np.diff(self.angle) > 0)):
+            raise InputError("The wavelengths and the angles of a calibration must increase.")
+        if self.lattice is not None and len(self.lattice.centre) != self.filters:
+            raise InputError(
+                f"The lattice has {len(self.lattice.centre)} units, the sensitivity {self.filters}."
+            )
 
     @classmethod
     def from_sensitivity(

@@ -20,7 +20,7 @@ class _Section(BaseModel):
 
 
 class Array(_Section):
-    """The lens array. pitch, position_error um; rotation degrees; offset px (y, x)."""
+    """The lens array. pitch, position_error um; rotation degrees, clockwise; offset px (y, x)."""
 
     rows: int = Field(gt=0, le=64)
     columns: int = Field(gt=0, le=64)

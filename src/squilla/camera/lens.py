@@ -23,7 +23,8 @@ def defocus(design: CameraDesign, angle: np.ndarray, distance: float) -> tuple[n
     Returns
     -------
     sagittal, tangential : array, (A, K)
-        um; positive where the image forms in front of the sensor.
+        um; positive where the image forms in front of the sensor. Without the effect of field
+        curvature ``design.lens.defocus``, which balances it, is left out too.
 
     Source: thin-lens equation with the glass' dispersion; Coddington's equations give the image
     surfaces of a thin lens the curvatures (1 + 1/n)/f and (3 + 1/n)/f.
@@ -33,8 +34,8 @@ def defocus(design: CameraDesign, angle: np.ndarray, distance: float) -> tuple[n
     index = np.real(refractive_index(lens.glass, design.wavelength))
     centre = np.real(refractive_index(lens.glass, np.array([lens.focus_wavelength])))[0]
     focal_length = focal * (centre - 1) / (index - 1) if effects.chromatic_focus else focal
-    image = focal_length * np.ones(len(index)) + focal**2 / (1000 * distance)
-    sensor = focal + focal**2 / (1000 * lens.focus_distance) + lens.defocus
+    image = focal_length * np.ones(len(index)) + focal**2 / (1000 * distance - focal)
+    sensor = focal + focal**2 / (1000 * lens.focus_distance - focal) + lens.defocus
     height = focal * np.tan(angle)[:, None]
     bend = height**2 / (2 * focal) if effects.field_curvature else 0 * height
     sagittal = sensor - image + (1 + 1 / centre) * bend

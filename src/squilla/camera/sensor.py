@@ -111,6 +111,8 @@ class ImageSensor:
         InputError
             If the pixels are dark, or would saturate before they reach this ratio.
         """
+        if not np.isfinite(snr):
+            raise InputError(f"The SNR must be a number of dB, not {snr:g}.")
         signal = float(np.mean(np.square(rate, dtype=np.float64)))
         if signal <= 0:
             raise InputError("The scene sends no light to the sensor; no exposure reaches an SNR.")

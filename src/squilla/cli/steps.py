@@ -220,8 +220,9 @@ def evaluate(
 
 
 def read_sweep(folder: Path) -> "Iterator[SweepStep]":
-    """Go through the frames that ``sweep.csv`` in a folder lists, one by one."""
+    """Read ``sweep.csv`` in a folder at once, and return an iterator over the frames it lists."""
     from squilla.calibration.sensitivity import SweepStep
+    from squilla.files.disk import existing
     from squilla.files.raw import read_raw
 
     table = folder / "sweep.csv"
@@ -233,19 +234,21 @@ def read_sweep(folder: Path) -> "Iterator[SweepStep]":
             f"{table} cannot be read ({error}); a sweep is a folder of frames with a table "
             "sweep.csv of file, wavelength, power, bandwidth."
         ) from error
+    listed = []
     for number, row in enumerate(rows, 2):
         try:
-            name = row["file"]
+            path = folder / row["file"]
             values = [float(row[key]) for key in ("wavelength", "power", "bandwidth")]
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"{table}, line {number}: wanted are file, wavelength, power and bandwidth (nm)."
             ) from error
-        yield SweepStep(read_raw(folder / name), *values)
+        listed.append((existing(path), values))
+    return (SweepStep(read_raw(path), *values) for path, values in listed)
 
 
 def read_depth(path: Path, shape: tuple[int, ...]):
-    """Read a depth map, mm, and bring it to the shape of the scene, (y, x) float64."""
+    """Read a depth map, mm, and cut and resize it as `fitted` does the scene, (y, x) float64."""
     import numpy as np
 
     try:
@@ -257,12 +260,14 @@ def read_depth(path: Path, shape: tuple[int, ...]):
             depth = np.asarray(tifffile.imread(path))
     except Exception as error:  # tifffile and NumPy fail on bad bytes in many ways
         raise InputError(f"The depth map {path} cannot be read: {error}.") from error
-    if depth.ndim != 2 or depth.dtype.kind not in "uif":
+    if depth.ndim != 2 or depth.size == 0 or depth.dtype.kind not in "uif":
         raise InputError(f"The depth map {path} must be one picture of distances in mm.")
     if depth.shape != tuple(shape):
         from scipy.ndimage import zoom
 
-        depth = np.asarray(
-            zoom(depth.astype(float), np.divide(shape, depth.shape), order=1, grid_mode=True)
-        )
+        side = min(depth.shape)
+        top, left = ((length - side) // 2 for length in depth.shape)
+        square = depth[top : top + side, left : left + side].astype(float)
+        factor = np.divide(shape, side)
+        depth = np.asarray(zoom(square, factor, order=1, mode="nearest", grid_mode=True))
     return depth.astype(float)
