@@ -6,6 +6,7 @@ those frames. The truth comes back at the end, to judge.
 
 import json
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from time import perf_counter
 from typing import TypeVar
@@ -28,7 +29,7 @@ from squilla.evaluation.report import Trial, results_section, scene_section, wri
 from squilla.files.cube import save
 from squilla.files.disk import replacing
 from squilla.files.raw import Raw, read_raw, write_raw
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.reconstructor import load_model, model_class
 from squilla.spectra import lights
 
 MODELS = ("ridge", "sparse", "mlp")
@@ -76,19 +77,20 @@ def demo(
     dict
         What ``metrics.json`` holds: scene -> model -> metric -> number.
     """
-    folder = Path(folder)
+    folder, models = Path(folder), list(models)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"The folder {folder} cannot be made: {error.strerror}.") from error
     twin = Camera(camera)
-    with _progress() as progress:
+    with _progress() as progress, ThreadPoolExecutor(1) as pool:
+        warm = pool.submit(_warm_up, models)
         learnt = _calibrate(twin, seed, progress)
         learnt.save(folder / "calibration.nc")
         calibration = load_calibration(folder / "calibration.nc")
         trials, metrics = [], {}
         reconstructors = {name: load_model(name, calibration) for name in models}
-        _warm_up(reconstructors.values(), calibration)
+        warm.result()
         for number, name in enumerate(_counted(progress, "scenes", list(scenes))):
             scene = load_scene(name, twin.design.wavelength, twin.design.field.size)
             generator = torch.Generator().manual_seed(1000 * seed + number)
@@ -112,7 +114,8 @@ def demo(
             }
             metrics[name]["alignment_rms_px"] = alignment_error(calibration, measurement, truth)
         _write_json(folder / "metrics.json", metrics)
-        sections = [results_section(trials), *map(scene_section, trials)]
+        sections = [results_section(trials)]
+        sections += [scene_section(trial) for trial in _counted(progress, "pictures", trials)]
         facts = {
             "camera": twin.serial,
             "distance": f"{distance:g} mm",
@@ -123,7 +126,7 @@ def demo(
         }
         write_report(
             folder / "report.html",
-            list(_counted(progress, "report", sections)),
+            sections,
             title="From one exposure to a spectrum in every pixel",
             text="Three scenes seen once by the digital twin of the thesis' camera and "
             "reconstructed from its raw frames alone. The truth is used only to judge.",
@@ -206,10 +209,12 @@ def _unaligned(raw: Raw, calibration: Calibration) -> np.ndarray:
     return y.permute(2, 0, 1).numpy()
 
 
-def _warm_up(reconstructors: Iterable, calibration: Calibration) -> None:
-    """Let compilers finish before anything is timed."""
-    for reconstructor in reconstructors:
-        reconstructor(torch.ones(2, calibration.filters), torch.zeros(2))
+def _warm_up(models: Iterable[str]) -> None:
+    """Let the models' compilers finish, on a random camera, before anything is timed."""
+    response = np.random.default_rng(0).random((12, 51))
+    camera = Calibration.from_sensitivity(response, np.linspace(500, 750, 51))
+    for name in models:
+        model_class(name)(camera)(torch.ones(2, 12))
 
 
 def _write_json(path: Path, content: dict) -> None:
