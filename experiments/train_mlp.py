@@ -1,9 +1,10 @@
 """Train the `mlp` that ships: broad prior, uniform noise, one camera.
 
-    python experiments/train_mlp.py --calibration camera.nc
+    python experiments/train_mlp.py --calibration demo/calibration.nc
 
 The network is judged on random spectra that it never saw, beside the linear estimator that knows
-the noise; no chart takes part. Interrupted, it goes on where it was when started again.
+the noise; no chart takes part. The defaults are those of the weights that ship; the model file and
+results/train_mlp.jsonl hold what they were trained with. Interrupted, it goes on where it was when started again.
 """
 
 import argparse
@@ -24,8 +25,8 @@ RESULTS = Path(__file__).parent / "results"
 def main() -> None:
     parser = argparse.ArgumentParser(description="Train the mlp that ships.")
     parser.add_argument("--calibration", type=Path, required=True, help="camera.nc")
-    parser.add_argument("--noise", default="15:40", help="dB; default 15:40")
-    parser.add_argument("--epochs", type=int, default=400, help="of 32 768 fresh spectra each")
+    parser.add_argument("--noise", default="5:40", help="dB; default 5:40")
+    parser.add_argument("--epochs", type=int, default=150, help="of 32 768 fresh spectra each")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=WEIGHTS)
     parser.add_argument("--work", type=Path, default=RESULTS, help="folder of log and checkpoint")
@@ -41,7 +42,7 @@ def main() -> None:
         noise=parse_noise(options.noise),
         count=32_768,
         epochs=options.epochs,
-        batch=256,
+        batch=512,
         learning_rate=1e-3,
         schedule="cosine",
         seed=options.seed,
