@@ -3,8 +3,9 @@
     python experiments/train_mlp.py --calibration demo/calibration.nc
 
 The network is judged on random spectra that it never saw, beside the linear estimator that knows
-the noise; no chart takes part. The defaults are those of the weights that ship; the model file and
-results/train_mlp.jsonl hold what they were trained with. Interrupted, it goes on where it was when started again.
+the noise; no chart takes part. Interrupted, it goes on where it was when started again. The
+defaults are those of the weights that ship; the model file and results/train_mlp.jsonl hold what
+they were trained with.
 """
 
 import argparse
