@@ -88,7 +88,7 @@ class Pixels:
         rows, columns = (length // DARK_BLOCK for length in self.valid.shape)
         part = self.valid[: rows * DARK_BLOCK, : columns * DARK_BLOCK]
         lit = part.reshape(rows, DARK_BLOCK, columns, DARK_BLOCK).any((1, 3))
-        return DARK_BLOCK * np.argwhere(~maximum_filter(lit, 7))
+        return DARK_BLOCK * np.argwhere(maximum_filter(lit, 7) == 0)
 
     def dark(self, exposure: float | None) -> np.ndarray:
         """Return what a frame of this exposure (ms) shows without light, (rows, columns) DN."""

@@ -208,7 +208,7 @@ def lateral_colour(design: CameraDesign, angle: np.ndarray, distance: float) -> 
     offset = np.array(design.filters.decentre)
     near = 1 - design.filters.distance / design.lens.focal_length
     radius, half = design.lens.diameter / 2 * near, design.filters.size / 2
-    middle = np.array(_overlap(*-offset, radius, half)[1:]) + offset
+    middle = np.array(_overlap(-offset[0], -offset[1], radius, half)[1:]) + offset
     return -behind[..., None] * middle / near / design.sensor.pixel
 
 
@@ -290,7 +290,7 @@ def _passing(design: CameraDesign, angle: float, x: np.ndarray, y: np.ndarray) -
         return np.ones(np.broadcast_shapes(np.shape(y), np.shape(x)))
     near = filters.distance / design.lens.focal_length
     along, across = x * (1 - near) + design.lens.focal_length * np.tan(angle) * near, y * (1 - near)
-    total = 0.0
+    total = np.zeros(np.broadcast_shapes(np.shape(along), np.shape(across)))
     turns = 2 * np.pi * (np.arange(16) + 0.5) / 16
     for cosine, sine in zip(np.cos(turns), np.sin(turns), strict=True):
         down = along * sine + across * cosine - filters.decentre[0]

@@ -13,19 +13,14 @@ from numpy.typing import ArrayLike
 from torch import Generator, Tensor
 from xarray import DataArray
 
-from squilla.camera import lens, warp
+from squilla.camera import channels, lens, warp
 from squilla.camera.blur import Blur, shift
 from squilla.camera.design import CameraDesign
 from squilla.camera.sensor import ImageSensor
 from squilla.errors import InputError
 from squilla.files.raw import Raw
-from squilla.optics.filters import (
-    FabryPerotRecipe,
-    StencilRecipe,
-    linear_variable_filter,
-    read_filters,
-)
-from squilla.optics.tables import band_pass
+from squilla.optics.filters import FilterArray
+from squilla.optics.tables import MeasuredFilters
 from squilla.spectra import resample
 
 
@@ -76,33 +71,9 @@ class Camera:
         self.windows = [lens.lit(self.design, unit) for unit in range(self.design.units)]
 
     @cached_property
-    def filters(self):
+    def filters(self) -> FilterArray | MeasuredFilters:
         """The filters, with a method ``transmittance(wavelength, angle)``."""
-        filters, count = self.design.filters, self.design.channels
-        band = self.design.wavelength[0], self.design.wavelength[-1]
-        match filters.recipe:
-            case "stencil":
-                return StencilRecipe(filters=count).draw(filters.seed)
-            case "fabry-perot":
-                return FabryPerotRecipe(filters=count, band=band).draw(filters.seed)
-            case "linear-variable":
-                return linear_variable_filter(count, band)
-            case "band-pass":
-                return band_pass(
-                    count,
-                    self.design.wavelength,
-                    fwhm=filters.fwhm,
-                    effective_index=filters.effective_index,
-                )
-        assert filters.table is not None
-        array = read_filters(filters.table, effective_index=filters.effective_index)
-        given = len(array.transmittance(self.design.wavelength))
-        if given != count:
-            raise InputError(
-                f"The filter file {filters.table} has {given} filters; the camera has {count} "
-                f"{'units' if filters.layout == 'array' else 'filters'}."
-            )
-        return array
+        return channels.filters_of(self.design)
 
     @cached_property
     def angles(self) -> np.ndarray:
@@ -142,47 +113,20 @@ class Camera:
         Returns
         -------
         array, (A, M, K), e-/ms
-
-        Source: radiance x solid angle of the pupil x pixel area x band x T Q; T averaged over the
-        cone of light that reaches the pixel.
         """
-        design, angle = self.design, np.atleast_1d(np.asarray(angle, float))
-        cones = [lens.cone(design, float(one)) for one in angle]
-        widest = max(angles.max() for angles, _ in cones)
-        square = np.linspace(0, widest**2, 48 if widest > 0 else 1)  # T is smooth in the square
-        table = self.filters.transmittance(design.wavelength, np.sqrt(square)).numpy()
-        flat = table.reshape(len(square), -1)
-        mean = np.stack(
-            [
-                weights @ resample(flat.T, square, angles**2).T if len(square) > 1 else flat[0]
-                for angles, weights in cones
-            ]
-        ).reshape(len(angle), *table.shape[1:])
-        return mean * self._clear_response
+        return channels.response(self.design, self.filters, angle)
 
     @cached_property
-    def _clear_response(self) -> np.ndarray:
+    def clear_response(self) -> np.ndarray:
         """Photoelectrons per ms of a scene of value 1 in each band, without any filter, (K,)."""
-        design = self.design
-        solid = np.pi * (design.lens.diameter / 2) ** 2 / design.lens.focal_length**2
-        pixel = (design.sensor.pixel * 1e-6) ** 2
-        scale = design.light.radiance * solid * pixel / 1000 * design.band.step
-        return scale * design.quantum_efficiency
+        return channels.clear_response(self.design)
 
     def sensitivity(self, angle: ArrayLike) -> np.ndarray:
         """Return the true sensitivity, (A, M, K) DN/ms; for judging a calibration only.
 
         What leaks beside the filters is its mean around the axis.
         """
-        angle = np.atleast_1d(np.asarray(angle, float))
-        falloff = np.cos(angle) ** 4 if self.design.effects.vignetting else np.ones(len(angle))
-        turn = 2 * np.pi * (np.arange(32) + 0.5) / 32
-        radius = np.tan(angle)[:, None] * self.design.focal
-        through = lens.through_filter(self.design, radius * np.sin(turn), radius * np.cos(turn))
-        through = through.mean(1)[:, None, None]
-        gap = (1 - through) * self.design.filters.gap * self._clear_response
-        seen = through * self.response(angle) + gap
-        return seen * falloff[:, None, None] / self.design.sensor.gain
+        return channels.seen(self.design, self.filters, angle) / self.design.sensor.gain
 
     @cached_property
     def _node_response(self) -> np.ndarray:
@@ -336,7 +280,7 @@ class Camera:
         """Return the photoelectrons per ms of an evenly lit surface, in the shape of `rate`."""
         light = np.asarray(light, float)
         rates = self._node_response @ light
-        leaking = self.design.filters.gap * self._clear_response @ light
+        leaking = self.design.filters.gap * self.clear_response @ light
         total = np.zeros(self._frames, np.float32)
         for channel in range(self.design.channels):
             view, part = self._behind(total, channel)
@@ -379,7 +323,7 @@ class Camera:
             filtered = (response[:, None, :] * blur.weight).flatten(0, 1)
             return (pixels @ filtered.T).view(*values.shape[:2], *blur.weight.shape[:2]).numpy()
 
-        gap = self.design.filters.gap * torch.from_numpy(self._clear_response).float()
+        gap = self.design.filters.gap * torch.from_numpy(self.clear_response).float()
         leaking = seen(gap.expand(len(response), -1)) if self.design.filters.gap else None
         total = np.zeros(self._frames, np.float32)
         for channel in range(self.design.channels):
