@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.disparity import edges, find_disparity
+from squilla.calibration.stray import stray_light
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 
@@ -92,7 +93,8 @@ def measure(
         if score < _TEXTURED:
             disparity, how = lattice.disparity(lattice.usual), "no texture: at the usual distance"
     y, valid = align(views, lattice, disparity)
-    snr_of_point = _pointwise_snr(y, pixels)
+    snr_of_point = pointwise_snr(y, pixels)
+    signal = float(y.mean())
     y = y / (raw.exposure or 1.0)
     shape = lattice.field
     return Measurement(
@@ -110,6 +112,7 @@ def measure(
             "distance": lattice.distance(disparity),
             "alignment": how,
             "alignment_score": score,
+            **stray_light(raw.frame, raw.exposure, pixels, signal),
         },
     )
 
@@ -214,7 +217,7 @@ def _noise_variance(views: SubImages, pixels: Pixels) -> np.ndarray:
     return signal / pixels.gain + (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
 
 
-def _pointwise_snr(y: Tensor, pixels: Pixels) -> Tensor:
+def pointwise_snr(y: Tensor, pixels: Pixels) -> Tensor:
     """Return the signal-to-noise ratio of aligned points, (H, W, M) DN -> (H, W) dB."""
     noise = y.mean(-1).clamp_min(0) / pixels.gain + (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
     power = (y.square().mean(-1) - noise).clamp_min(0.1 * noise)

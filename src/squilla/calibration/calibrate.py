@@ -10,6 +10,7 @@ from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.geometry import lattice_from_flat, refine_with_target
 from squilla.calibration.pixels import Darks, Stack, defective, noise_of
 from squilla.calibration.sensitivity import SweepStep, Zones, sweep_responses, unfold
+from squilla.calibration.stray import stray_light
 from squilla.camera.design import CameraDesign
 from squilla.errors import InputError
 from squilla.files.raw import Raw
@@ -48,6 +49,11 @@ def calibrate(
     InputError
         If the frames do not show what they should; the message names the frame.
     """
+    if design.filters.layout != "array":
+        raise InputError(
+            f"The filters of {design.name!r} are in a {design.filters.layout} layout; only cameras "
+            "with a lens array are calibrated from frames."
+        )
     darks = Darks.of(dark)
     flats = Stack.of(flat, "flat")
     if darks.bias.shape != design.sensor_shape or flats.mean.shape != design.sensor_shape:
@@ -86,21 +92,24 @@ def calibrate(
     relative = np.where(valid, light / np.maximum(surface, 1e-6), 1.0).astype(np.float32)
 
     bias = np.where(lit, darks.bias, np.median(darks.bias)).astype(np.float32)
-    dark_rate = np.where(lit, darks.rate, 0).astype(np.float32)
+    dark_rate = np.where(lit, darks.rate, np.median(darks.rate)).astype(np.float32)
     wavelength, bandwidth, response = sweep_responses(sweep, darks, relative, saturation, zones)
     sensitivity = np.maximum(unfold(wavelength, bandwidth, response, design.wavelength), 0)
+    pixels = Pixels(bias, dark_rate, relative, valid, saturation, gain, read_noise)
+    signal = float(windows(light, lattice, 0)[1].mean())
     return Calibration(
         design.wavelength,
         sensitivity,
         zones.angle,
         lattice,
-        Pixels(bias, dark_rate, relative, valid, saturation, gain, read_noise),
+        pixels,
         {
             "software": f"squilla {__version__}",
             "design": design.name,
             "camera": flats.camera,
             "sweep_steps": len(wavelength),
             **aligned,
+            **stray_light(flats.mean, flats.exposure, pixels, signal),
             "bad_pixels": int((~windows(valid, lattice, 0)[1]).sum()),
         },
     )

@@ -11,6 +11,9 @@ from torch import Tensor
 
 from squilla.errors import InputError
 
+DARK_BLOCK = 8
+"""Side of the blocks over which the sensor's dark parts are averaged, px."""
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -73,6 +76,19 @@ class Pixels:
     saturation: float
     gain: float
     read_noise: float
+
+    @cached_property
+    def dark_blocks(self) -> np.ndarray:
+        """Corners of the blocks of `DARK_BLOCK` px far from every lit pixel, (N, 2) px.
+
+        Three blocks next to a sub-image are left out: its penumbra reaches there.
+        """
+        from scipy.ndimage import maximum_filter
+
+        rows, columns = (length // DARK_BLOCK for length in self.valid.shape)
+        part = self.valid[: rows * DARK_BLOCK, : columns * DARK_BLOCK]
+        lit = part.reshape(rows, DARK_BLOCK, columns, DARK_BLOCK).any((1, 3))
+        return DARK_BLOCK * np.argwhere(maximum_filter(lit, 7) == 0)
 
     def dark(self, exposure: float | None) -> np.ndarray:
         """Return what a frame of this exposure (ms) shows without light, (rows, columns) DN."""

@@ -144,7 +144,7 @@ def lattice_from_flat(flat: np.ndarray, design: CameraDesign) -> Lattice:
 
     What lights a sub-image is the aperture stop at a finite distance D, so the windows lie wider
     apart than the lenses by 1 + f / D; the design knows both. The middle of the array is taken to
-    face the middle of the stop.
+    face the middle of the stop. Walls light it straight through the lens.
 
     Parameters
     ----------
@@ -153,11 +153,14 @@ def lattice_from_flat(flat: np.ndarray, design: CameraDesign) -> Lattice:
     design : CameraDesign
         For the nominal pitch, the stop and the focal length.
     """
-    if design.stop is None:
+    if design.stop is None and design.walls is None:
         raise InputError(
-            "Without an aperture stop the sub-images overlap; a flat frame cannot tell them apart."
+            "Without an aperture stop or walls the sub-images overlap; a flat frame cannot tell "
+            "them apart."
         )
-    wider = 1 + design.lens.focal_length / (1000 * design.stop.distance)
+    wider = 1.0
+    if design.stop is not None:
+        wider += design.lens.focal_length / (1000 * design.stop.distance)
     shape = (design.array.rows, design.array.columns)
     found = find_windows(flat, shape, design.pitch * wider)
     middle = found.mean(0)

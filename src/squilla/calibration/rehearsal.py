@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Generator
 from xarray import DataArray
 
+from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.sensitivity import SweepStep
 from squilla.camera.twin import Camera
 from squilla.files.raw import Raw
@@ -103,6 +104,51 @@ class Rehearsal:
 
     def _generator(self, kind: int, number: int) -> Generator:
         return torch.Generator().manual_seed(1_000_003 * self.seed + 10_007 * kind + number)
+
+
+def ideal_calibration(camera: Camera, angles: int = 5) -> Calibration:
+    """Return the calibration that perfect frames would give; for judging and comparing only.
+
+    Parameters
+    ----------
+    camera : Camera
+        Of any layout; a mosaic's or a sequence's filters all lie at the place of the one lens.
+    angles : int
+        Number of field angles from the axis to the corner of the field.
+    """
+    design = camera.design
+    corner = np.arctan(np.hypot(design.field.size / 2, design.field.size / 2) / design.focal)
+    angle = np.sqrt(np.linspace(0, corner**2, angles))
+    array = design.filters.layout == "array"
+    centre = np.repeat(design.centres, 1 if array else design.channels, 0)
+    reference = design.field.reference
+    lattice = Lattice(
+        shape=(design.array.rows, design.array.columns),
+        centre=centre,
+        baseline=(centre - centre[reference]) / design.pitch,
+        reference=reference,
+        field=(design.field.size, design.field.size),
+        focal=design.focal,
+        pitch=design.pitch,
+        pixel=design.sensor.pixel,
+        usual=design.lens.focus_distance,
+    )
+    sensor = design.sensor
+    dark_rate = camera.sensor.dark_rate / sensor.gain
+    usual_rate = np.float32(sensor.dark_current / 1000 / sensor.gain)
+    pixels = Pixels(
+        bias=np.full(design.sensor_shape, sensor.black_level, np.float32),
+        dark_rate=dark_rate.astype(np.float32),
+        flat=camera.sensor.response,
+        valid=dark_rate <= 10 * usual_rate,
+        saturation=0.98 * (2**sensor.bits - 1),
+        gain=sensor.gain,
+        read_noise=sensor.read_noise,
+    )
+    provenance = {"design": design.name, "camera": camera.serial, "made": "from the twin's truth"}
+    return Calibration(
+        design.wavelength, camera.sensitivity(angle), angle, lattice, pixels, provenance
+    )
 
 
 def poster(size: int, wavelength: np.ndarray, seed: int = 0) -> DataArray:

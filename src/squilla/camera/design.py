@@ -12,6 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from squilla.errors import InputError
 from squilla.spectra import grid
 
+_BUILT_IN = Path(str(package_files("squilla"))) / "data" / "cameras"
+
 
 class _Section(BaseModel):
     model_config = ConfigDict(
@@ -43,28 +45,58 @@ class Lens(_Section):
 
 
 class Filters(_Section):
-    """The filters: a recipe drawn with a seed, or a file of stacks or measured responses.
+    """The filters: where they sit, and what they are: a recipe drawn with a seed, or a file.
 
-    effective_index : of the films, for the blue shift of measured filters at an angle.
+    layout : "array", one under each lens; "mosaic", on the pixels behind a single lens; or
+        "sequential", one after another before a single lens, an exposure for each.
+    shape : rows and columns of a mosaic's tile, or of the plate that a sequence goes through.
+    fwhm : width of the bands of the recipe "band-pass", nm.
+    table : stacks or measured responses; see `squilla.optics.filters.read_filters`.
+    effective_index : of the films, for the blue shift of tabulated filters at an angle.
+    size : side of each square filter of an array, um; without it a filter covers its lens.
+    distance : from the lenses to the filters behind them, um.
+    gap : transmittance of the gaps between the filters, 0 for opaque ones, 0.92 for bare glass.
+    decentre : of the filter plate against the lenses, um (y, x).
     """
 
-    recipe: Literal["stencil"] | None = None
+    layout: Literal["array", "mosaic", "sequential"] = "array"
+    shape: tuple[int, int] | None = None
+    recipe: Literal["stencil", "fabry-perot", "band-pass", "linear-variable"] | None = None
     seed: int = Field(0, ge=0)
+    fwhm: float = Field(12.0, gt=0)
     table: Path | None = None
     effective_index: float | None = Field(None, gt=1)
+    size: float | None = Field(None, gt=0)
+    distance: float = Field(0.0, ge=0)
+    gap: float = Field(0.0, ge=0, le=1)
+    decentre: tuple[float, float] = (0.0, 0.0)
 
     @model_validator(mode="after")
-    def _one_source(self):
+    def _well_formed(self):
         if (self.recipe is None) == (self.table is None):
             raise ValueError("give either a recipe or a table")
+        if (self.layout == "array") != (self.shape is None):
+            raise ValueError("a shape belongs to the layouts mosaic and sequential, and only there")
+        if self.shape is not None and not all(1 <= side <= 16 for side in self.shape):
+            raise ValueError("the shape must be within 1 to 16 rows and columns")
+        if self.size is None and (self.distance, self.gap, *self.decentre) != (0, 0, 0, 0):
+            raise ValueError("distance, gap and decentre need the size of the filters")
         return self
 
 
 class Stop(_Section):
-    """The square aperture stop in front of the array. width, distance mm."""
+    """The aperture stop in front of the array, square or round. width, distance mm."""
 
     width: float = Field(gt=0)
     distance: float = Field(gt=0)
+    round: bool = False
+
+
+class Walls(_Section):
+    """Walls between the tiles of the lenses, hanging from the lens plane. height, thickness um."""
+
+    height: float = Field(gt=0)
+    thickness: float = Field(0.0, ge=0)
 
 
 class Spectrum(_Section):
@@ -154,6 +186,8 @@ class Effects(_Section):
     field_curvature: bool = True
     field_angle: bool = True
     cone: bool = True
+    pupil_leak: bool = True
+    lateral_colour: bool = True
     vignetting: bool = True
     shot_noise: bool = True
     read_noise: bool = True
@@ -169,7 +203,7 @@ class CameraDesign(_Section):
     """A camera on paper: every figure that the twin needs, checked.
 
     Read with `CameraDesign.load`; change with ``design.model_copy(update={"stop": None})``.
-    Without a stop neighbouring sub-images leak into each other.
+    Without a stop or walls neighbouring sub-images leak into each other.
     """
 
     name: str
@@ -181,6 +215,7 @@ class CameraDesign(_Section):
     band: Band
     light: Light
     stop: Stop | None = None
+    walls: Walls | None = None
     effects: Effects = Effects()
 
     @classmethod
@@ -190,8 +225,9 @@ class CameraDesign(_Section):
         Parameters
         ----------
         source : str or Path
-            "thesis", or the path of a TOML file of the same form (``squilla camera --toml`` prints
-            one to start from). A filter table in it is looked for beside the file.
+            The name of a built-in design (`designs`), or the path of a TOML file of the same form
+            (``squilla camera --toml`` prints one to start from). A filter table in it is looked for
+            beside the file.
 
         Raises
         ------
@@ -220,6 +256,15 @@ class CameraDesign(_Section):
         units = self.array.rows * self.array.columns
         if self.field.reference >= units:
             raise ValueError(f"field.reference must be one of the units 0 to {units - 1}")
+        if self.filters.layout != "array" and units > 1:
+            raise ValueError(f"filters in a {self.filters.layout} layout have a single lens")
+        if self.filters.distance >= self.lens.focal_length:
+            raise ValueError("filters.distance must be less than the focal length")
+        if self.walls is not None:
+            if self.walls.height > self.lens.focal_length:
+                raise ValueError("walls.height must not exceed the focal length")
+            if self.walls.thickness > self.array.pitch - self.lens.diameter:
+                raise ValueError("walls.thickness must leave the lenses free")
         if self.field.size > self.pitch:
             raise ValueError(
                 f"the sub-images overlap: a field of {self.field.size} px does not fit between "
@@ -240,8 +285,23 @@ class CameraDesign(_Section):
 
     @property
     def units(self) -> int:
-        """Number of lenses and filters, M."""
+        """Number of lenses."""
         return self.array.rows * self.array.columns
+
+    @property
+    def channels(self) -> int:
+        """Number of filters, M; as many as lenses in an array."""
+        rows, columns = self.filters.shape or (self.array.rows, self.array.columns)
+        return rows * columns
+
+    @cached_property
+    def mosaic(self) -> np.ndarray:
+        """Which filter lies on each pixel of a mosaic's tile, drawn by the filters' seed.
+
+        Pixel (0, 0) of the sensor has the tile's first.
+        """
+        order = np.random.default_rng(self.filters.seed).permutation(self.channels)
+        return order.reshape(self.filters.shape or (1, -1))
 
     @property
     def pitch(self) -> float:
@@ -286,13 +346,16 @@ class CameraDesign(_Section):
         return np.interp(self.wavelength, table.wavelength, table.value)
 
 
+def designs() -> list[str]:
+    """Return the names of the camera designs that are built in."""
+    return sorted(path.stem for path in _BUILT_IN.glob("*.toml"))
+
+
 def design_path(source: str | Path) -> Path:
     """Return the file of a built-in or own camera design; InputError where there is none."""
-    built_in = Path(str(package_files("squilla"))) / "data" / "cameras"
-    for path in (built_in / f"{source}.toml", Path(source)):
+    for path in (_BUILT_IN / f"{source}.toml", Path(source)):
         if path.is_file():
             return path
-    names = sorted(path.stem for path in built_in.glob("*.toml"))
     raise InputError(
-        f"There is no camera design {str(source)!r}: give one of {names} or a TOML file."
+        f"There is no camera design {str(source)!r}: give one of {designs()} or a TOML file."
     )

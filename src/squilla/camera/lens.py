@@ -50,8 +50,9 @@ def transfer_function(
 ) -> np.ndarray:
     """Return the modulation transfer of the lens, averaged over orientation.
 
-    The autocorrelation of a round pupil with the phase of the defocus. Without diffraction the
-    geometric transfer of the blur disc takes its place.
+    The autocorrelation of a round pupil with the phase of the defocus, cut to the filter where the
+    gaps between filters are opaque. Without diffraction the geometric transfer of the whole lens'
+    blur disc takes its place.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ def transfer_function(
     samples = 48  # across the pupil; the phase there turns by at most two waves
     axis = (np.arange(samples) - (samples - 1) / 2) * 2 / samples
     y, x = axis[:, None], axis[None, :]
-    pupil = (x**2 + y**2 <= 1).astype(float)
+    disc = (x**2 + y**2 <= 1).astype(float)
     shift = np.fft.fftfreq(2 * samples, 1 / (2 * samples)) * 2 * radius / samples
     ring = np.rint(np.hypot(shift[:, None], shift[None, :]) / (2 * radius / samples)).astype(int)
     members = np.bincount(ring.ravel())
@@ -87,6 +88,9 @@ def transfer_function(
 
     transfer = np.empty((len(angle), len(few), len(frequency)))
     for a in range(len(angle)):
+        pupil = disc
+        if not design.filters.gap:  # where the gaps are clear, the whole lens makes the picture
+            pupil = disc * np.sqrt(_passing(design, float(angle[a]), radius * x, radius * y))
         for k, colour in enumerate(few):
             path = radius**2 / (2 * focal**2) * (sagittal[a, k] * x**2 + tangential[a, k] * y**2)
             if design.effects.diffraction:
@@ -129,8 +133,8 @@ def cone(design: CameraDesign, angle: float, rings: int = 4) -> tuple[np.ndarray
     Returns
     -------
     angles, weights : array, (P,)
-        rad; weights are cos^4 and sum to 1. Without the cone only the chief ray; without the
-        field angle the pixel is taken to be on the axis.
+        rad; weights are cos^4 and sum to 1, without the light that misses the filter. Without the
+        cone only the chief ray; without the field angle the pixel is taken to be on the axis.
     """
     chief = np.tan(angle) if design.effects.field_angle else 0.0
     if not design.effects.cone:
@@ -142,10 +146,70 @@ def cone(design: CameraDesign, angle: float, rings: int = 4) -> tuple[np.ndarray
         radius = slope * np.sqrt(3 * ring**2 / (3 * rings * (rings + 1) + 1))
         x.append(radius * np.cos(turn))
         y.append(radius * np.sin(turn))
-    tangent = np.hypot(chief - np.concatenate(x), np.concatenate(y))
-    angles = np.arctan(tangent)
-    weights = np.cos(angles) ** 4
+    x, y = np.concatenate(x), np.concatenate(y)
+    angles = np.arctan(np.hypot(chief - x, y))
+    focal = design.lens.focal_length
+    weights = np.cos(angles) ** 4 * _passing(design, float(angle), focal * x, focal * y)
     return angles, weights / weights.sum()
+
+
+def through_filter(design: CameraDesign, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the share of a lens' light that goes through its filter; the rest meets the gap.
+
+    Seen from a pixel the pupil, cast onto the plane of the filters, is a smaller disc, displaced
+    towards the pixel.
+
+    Parameters
+    ----------
+    design : CameraDesign
+    y, x : array, (...)
+        Position of pixels on the sensor against the lens' axis, px.
+
+    Returns
+    -------
+    array, (...), 0..1
+    """
+    if design.filters.size is None or not design.effects.pupil_leak:
+        return np.ones(np.broadcast_shapes(np.shape(y), np.shape(x)))
+    near = design.filters.distance / design.lens.focal_length
+    dy, dx = design.filters.decentre
+    pixel = design.sensor.pixel
+    radius = design.lens.diameter / 2 * (1 - near)
+    return _overlap(pixel * y * near - dy, pixel * x * near - dx, radius, design.filters.size / 2)[
+        0
+    ]
+
+
+def lateral_colour(design: CameraDesign, angle: np.ndarray, distance: float) -> np.ndarray:
+    """Return how far each wavelength's image is displaced by a pupil beside the lens' axis.
+
+    Filters that are not centred on their lenses leave a pupil that is not, so that light out of
+    focus lands beside the axis. The light through clear gaps is taken along.
+
+    Parameters
+    ----------
+    design : CameraDesign
+    angle : array, (A,)
+        Field angle, rad.
+    distance : float
+        Object distance, mm.
+
+    Returns
+    -------
+    array, (A, K, 2)
+        px (y, x).
+
+    Source: similar triangles; the ray through the middle of the pupil.
+    """
+    sagittal, tangential = defocus(design, angle, distance)
+    behind = (sagittal + tangential) / 2 / design.lens.focal_length
+    if design.filters.size is None or not design.effects.lateral_colour:
+        return np.zeros((*behind.shape, 2))
+    offset = np.array(design.filters.decentre)
+    near = 1 - design.filters.distance / design.lens.focal_length
+    radius, half = design.lens.diameter / 2 * near, design.filters.size / 2
+    middle = np.array(_overlap(-offset[0], -offset[1], radius, half)[1:]) + offset
+    return -behind[..., None] * middle / near / design.sensor.pixel
 
 
 def vignetting(
@@ -153,7 +217,8 @@ def vignetting(
 ) -> np.ndarray:
     """Return the share of light that reaches the sensor at positions about one lens.
 
-    cos^4 of the field angle, and the share of the pupil that sees the scene through the stop.
+    cos^4 of the field angle, and the share of the pupil that sees the scene through the stop and
+    is seen between the walls.
 
     Parameters
     ----------
@@ -168,45 +233,97 @@ def vignetting(
     """
     square = (rows[:, None] ** 2 + columns[None, :] ** 2) / design.focal**2
     share = (1 + square) ** -2.0 if design.effects.vignetting else np.ones_like(square)
-    if design.stop is None:
-        return share
-    middle = design.centres.mean(0)
-    axes = []
-    for position, centre, middle_of_array in zip(
-        (rows, columns), design.centres[unit], middle, strict=True
-    ):
-        # Where the ray from the middle of the pupil crosses the stop, in pupil radii.
-        lens = (centre - middle_of_array) * design.sensor.pixel
-        crossing = lens - position / design.focal * design.stop.distance * 1000
-        edge, radius = design.stop.width * 500, design.lens.diameter / 2
-        axes.append(
-            _disc_share((edge - crossing) / radius) - _disc_share((-edge - crossing) / radius)
-        )
-    if not design.effects.vignetting:
-        axes = [(axis > 0.5).astype(float) for axis in axes]
-    return share * axes[0][:, None] * axes[1][None, :]
+    radius, (y, x) = design.lens.diameter / 2, (rows[:, None], columns[None, :])
+    openings = []
+    if design.stop is not None:
+        # Where the ray from the middle of the pupil crosses the plane of the stop.
+        middle = (design.centres[unit] - design.centres.mean(0)) * design.sensor.pixel
+        reach = design.stop.distance * 1000 / design.focal
+        crossing, half = (middle[0] - y * reach, middle[1] - x * reach), design.stop.width * 500
+        if design.stop.round:
+            openings.append(_disc_share((half - np.hypot(*crossing)) / radius))
+        else:
+            openings += [_between(along, half, radius) for along in crossing]
+    if design.walls is not None:
+        deep = design.walls.height / design.lens.focal_length
+        half = (design.array.pitch - design.walls.thickness) / 2
+        cast = max(radius * (1 - deep), 1e-6)  # of the pupil on the plane of the walls' ends
+        openings += [_between(along * design.sensor.pixel * deep, half, cast) for along in (y, x)]
+    for opening in openings:
+        share = share * (opening if design.effects.vignetting else opening > 0.5)
+    return share
 
 
 def lit(design: CameraDesign, unit: int) -> tuple[slice, slice]:
     """Return the rows and columns of the sensor that one lens can light.
 
-    With a stop its image and penumbra; without one, one and a half pitches to each side: the
-    tile of the lens and those of its neighbours.
+    What the stop and the walls let through, penumbra included; without both the whole sensor.
     """
     slices = []
-    middle = design.centres.mean(0)
+    middle, focal = design.centres.mean(0), design.lens.focal_length
+    radius = design.lens.diameter / 2 / design.sensor.pixel
     for axis, size in enumerate(design.sensor_shape):
         centre = design.centres[unit, axis]
-        if design.stop is None:
-            low, high = centre - 1.5 * design.pitch, centre + 1.5 * design.pitch
-        else:
-            far = design.lens.focal_length / (1000 * design.stop.distance)
+        low, high = 0.0, float(size)
+        if design.stop is not None:
+            far = focal / (1000 * design.stop.distance)
             image = centre + (centre - middle[axis]) * far
-            half = design.stop.width / design.stop.distance * design.focal / 2
-            half += design.lens.diameter / 2 * far / design.sensor.pixel + 1
+            half = design.stop.width / design.stop.distance * design.focal / 2 + radius * far + 1
             low, high = image - half, image + half
+        if design.walls is not None:
+            deep = design.walls.height / focal
+            half = (design.pitch - design.walls.thickness / design.sensor.pixel) / 2
+            half = (half + radius * (1 - deep)) / deep + 1
+            low, high = max(low, centre - half), min(high, centre + half)
         slices.append(slice(max(0, int(np.floor(low))), min(size, int(np.ceil(high)) + 1)))
     return slices[0], slices[1]
+
+
+def _passing(design: CameraDesign, angle: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return how often points of the pupil are seen through the filter, (...) 0..1.
+
+    The mean over the directions in which a field of this angle (rad) lies from the axis; x points
+    that way, y across, both um in the plane of the lens.
+    """
+    filters = design.filters
+    if filters.size is None or not design.effects.pupil_leak:
+        return np.ones(np.broadcast_shapes(np.shape(y), np.shape(x)))
+    near = filters.distance / design.lens.focal_length
+    along, across = x * (1 - near) + design.lens.focal_length * np.tan(angle) * near, y * (1 - near)
+    total = np.zeros(np.broadcast_shapes(np.shape(along), np.shape(across)))
+    turns = 2 * np.pi * (np.arange(16) + 0.5) / 16
+    for cosine, sine in zip(np.cos(turns), np.sin(turns), strict=True):
+        down = along * sine + across * cosine - filters.decentre[0]
+        right = along * cosine - across * sine - filters.decentre[1]
+        total = total + (np.maximum(np.abs(down), np.abs(right)) < filters.size / 2)
+    # Where every point misses the filter nothing is seen, and it does not matter how.
+    return total / len(turns) if np.any(total) else np.ones_like(total)
+
+
+def _overlap(
+    y: np.ndarray, x: np.ndarray, radius: float, half: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what of discs about (y, x) lies within the square -half..half: share and middle.
+
+    Chords of the disc, cut to the square, summed along it by Gauss and Legendre's rule.
+    """
+    y, x = (np.asarray(each, float)[..., None] for each in (y, x))
+    node, weight = np.polynomial.legendre.leggauss(48)
+    low, high = (np.arcsin(np.clip((edge - y) / radius, -1, 1)) for edge in (-half, half))
+    turn = (low + high) / 2 + (high - low) / 2 * node
+    chord = radius * np.cos(turn)
+    left, right = np.maximum(x - chord, -half), np.minimum(x + chord, half)
+    area = (high - low) / 2 * weight * chord * np.maximum(right - left, 0)
+    total = np.maximum(area.sum(-1), 1e-9)
+    middle = (
+        (area * each).sum(-1) / total for each in (y + radius * np.sin(turn), (left + right) / 2)
+    )
+    return area.sum(-1) / (np.pi * radius**2), *middle
+
+
+def _between(crossing: np.ndarray, half: float, radius: float) -> np.ndarray:
+    """Return the share of discs of this radius about `crossing` that lies within -half..half."""
+    return _disc_share((half - crossing) / radius) - _disc_share((-half - crossing) / radius)
 
 
 def _disc_share(edge: np.ndarray) -> np.ndarray:

@@ -1,6 +1,8 @@
 """The digital twin: what the designed camera would record of a scene."""
 
 import hashlib
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,12 +13,14 @@ from numpy.typing import ArrayLike
 from torch import Generator, Tensor
 from xarray import DataArray
 
-from squilla.camera import lens, warp
+from squilla.camera import channels, lens, warp
+from squilla.camera.blur import Blur, shift
 from squilla.camera.design import CameraDesign
 from squilla.camera.sensor import ImageSensor
 from squilla.errors import InputError
 from squilla.files.raw import Raw
-from squilla.optics.filters import StencilRecipe, read_filters
+from squilla.optics.filters import FilterArray
+from squilla.optics.tables import MeasuredFilters
 from squilla.spectra import resample
 
 
@@ -67,30 +71,22 @@ class Camera:
         self.windows = [lens.lit(self.design, unit) for unit in range(self.design.units)]
 
     @cached_property
-    def filters(self):
+    def filters(self) -> FilterArray | MeasuredFilters:
         """The filters, with a method ``transmittance(wavelength, angle)``."""
-        filters = self.design.filters
-        if filters.table is None:
-            return StencilRecipe(filters=self.design.units).draw(filters.seed)
-        array = read_filters(filters.table, effective_index=filters.effective_index)
-        count = len(array.transmittance(self.design.wavelength))
-        if count != self.design.units:
-            raise InputError(
-                f"The filter file {filters.table} has {count} filters; the array has "
-                f"{self.design.units} units."
-            )
-        return array
+        return channels.filters_of(self.design)
 
     @cached_property
     def angles(self) -> np.ndarray:
         """Field angles between which filters and blur are interpolated, (A,) rad.
 
-        Evenly in the squared angle: four up to the field's corner, two beyond, to the last lit one.
+        Evenly in the squared angle: four up to the field's corner, and beyond to the last lit one
+        two, or up to six where nothing confines the light.
         """
         size = np.array([self.design.field.size / np.sqrt(2), self._farthest])
         corner, last = np.arctan(size / self.design.focal) ** 2
         last = max(last, 1.01 * corner)  # a narrow stop may leave the corners dark
-        return np.sqrt([*np.linspace(0, corner, 4), (corner + last) / 2, last])
+        beyond = min(max(2, int(last / corner / 4)), 6)
+        return np.sqrt([*np.linspace(0, corner, 4), *np.linspace(corner, last, beyond + 1)[1:]])
 
     @property
     def _farthest(self) -> float:
@@ -105,7 +101,9 @@ class Camera:
         return float(np.hypot(*np.array(reach).T).max())
 
     def response(self, angle: ArrayLike) -> np.ndarray:
-        """Return the photoelectrons per ms of a scene of value 1 in each band, before vignetting.
+        """Return the photoelectrons per ms of a scene of value 1 in each band.
+
+        Through the filters alone, before vignetting and what misses them.
 
         Parameters
         ----------
@@ -115,32 +113,20 @@ class Camera:
         Returns
         -------
         array, (A, M, K), e-/ms
-
-        Source: radiance x solid angle of the pupil x pixel area x band x T Q; T averaged over the
-        cone of light that reaches the pixel.
         """
-        design, angle = self.design, np.atleast_1d(np.asarray(angle, float))
-        cones = [lens.cone(design, float(one)) for one in angle]
-        widest = max(angles.max() for angles, _ in cones)
-        square = np.linspace(0, widest**2, 48 if widest > 0 else 1)  # T is smooth in the square
-        table = self.filters.transmittance(design.wavelength, np.sqrt(square)).numpy()
-        flat = table.reshape(len(square), -1)
-        mean = np.stack(
-            [
-                weights @ resample(flat.T, square, angles**2).T if len(square) > 1 else flat[0]
-                for angles, weights in cones
-            ]
-        ).reshape(len(angle), *table.shape[1:])
-        solid = np.pi * (design.lens.diameter / 2) ** 2 / design.lens.focal_length**2
-        pixel = (design.sensor.pixel * 1e-6) ** 2
-        scale = design.light.radiance * solid * pixel / 1000 * design.band.step
-        return scale * mean * design.quantum_efficiency
+        return channels.response(self.design, self.filters, angle)
+
+    @cached_property
+    def clear_response(self) -> np.ndarray:
+        """Photoelectrons per ms of a scene of value 1 in each band, without any filter, (K,)."""
+        return channels.clear_response(self.design)
 
     def sensitivity(self, angle: ArrayLike) -> np.ndarray:
-        """Return the true sensitivity, (A, M, K) DN/ms; for judging a calibration only."""
-        angle = np.atleast_1d(np.asarray(angle, float))
-        falloff = np.cos(angle) ** 4 if self.design.effects.vignetting else np.ones(len(angle))
-        return self.response(angle) * falloff[:, None, None] / self.design.sensor.gain
+        """Return the true sensitivity, (A, M, K) DN/ms; for judging a calibration only.
+
+        What leaks beside the filters is its mean around the axis.
+        """
+        return channels.seen(self.design, self.filters, angle) / self.design.sensor.gain
 
     @cached_property
     def _node_response(self) -> np.ndarray:
@@ -197,7 +183,8 @@ class Camera:
         ------
         InputError
             If the scene has NaN or negative values or does not cover the band, or if neither or
-            both of `exposure` and `snr` are given, or the SNR cannot be reached.
+            both of `exposure` and `snr` are given, or the SNR cannot be reached, or if the filters
+            are sequential.
         """
         if (exposure is None) == (snr is None):
             raise InputError("Give either an exposure in ms or an SNR in dB.")
@@ -206,6 +193,41 @@ class Camera:
             assert snr is not None
             exposure = self.sensor.exposure_for(self._fields(rate), snr)
         return self.expose(rate, exposure, generator)
+
+    def capture_sequence(
+        self,
+        scene: DataArray | Iterable[DataArray],
+        *,
+        exposure: float,
+        distance: float = 300.0,
+        generator: Generator | None = None,
+    ) -> Iterator[Raw]:
+        """Take the frames of a sequence, one through each filter.
+
+        Parameters
+        ----------
+        scene : DataArray, (y, x, wavelength), or one for each exposure if it moves
+        exposure : float
+            Of all frames together, ms.
+        distance, generator : as in `capture`
+
+        Yields
+        ------
+        Raw
+
+        Raises
+        ------
+        InputError
+            As `capture`, and if the camera's filters are not sequential.
+        """
+        count = self.design.channels
+        if self.design.filters.layout != "sequential":
+            raise InputError("This camera sees all of its filters at once; use Camera.capture.")
+        still = self.rate(scene, distance=distance) if isinstance(scene, DataArray) else None
+        scenes = [scene] * count if isinstance(scene, DataArray) else scene
+        for channel, one in enumerate(itertools.islice(scenes, count)):
+            rates = self.rate(one, distance=distance) if still is None else still
+            yield self.expose(rates[channel], exposure / count, generator)
 
     def capture_flat(
         self, light: np.ndarray, exposure: float, *, generator: Generator | None = None
@@ -238,6 +260,11 @@ class Camera:
         """Take a frame of the photoelectrons per ms, (rows, columns), that `rate` returned."""
         if not exposure > 0:
             raise InputError(f"The exposure must be a positive number of ms, not {exposure}.")
+        if rate.ndim > 2:
+            raise InputError(
+                f"This camera takes {len(rate)} exposures one after another, no single raw frame; "
+                "use Camera.capture_sequence."
+            )
         frame = self.sensor.expose(rate, exposure, generator=generator)
         return Raw(frame, exposure, {"camera": self.serial, "bits": self.design.sensor.bits})
 
@@ -245,23 +272,35 @@ class Camera:
         """Return the pixels within the units' fields, (M, size, size)."""
         size = self.design.field.size
         corner = np.rint(self.design.centres - (size - 1) / 2).astype(int)
-        return np.stack([image[y : y + size, x : x + size] for y, x in corner])
+        return np.stack([image[..., y : y + size, x : x + size] for y, x in corner])
 
     # --- light on the sensor ------------------------------------------------------------------
 
     def flat_rate(self, light: np.ndarray) -> np.ndarray:
-        """Return the photoelectrons per ms of an evenly lit surface, (rows, columns) float32."""
-        rates = self._node_response @ np.asarray(light, float)
-        total = np.zeros(self.design.sensor_shape, np.float32)
-        for unit, window in enumerate(self.windows):
-            square, share = self._geometry[unit]
-            warp.add_flat(square, share, self.angles**2, rates[:, unit], total[window])
+        """Return the photoelectrons per ms of an evenly lit surface, in the shape of `rate`."""
+        light = np.asarray(light, float)
+        rates = self._node_response @ light
+        leaking = self.design.filters.gap * self.clear_response @ light
+        total = np.zeros(self._frames, np.float32)
+        for channel in range(self.design.channels):
+            view, part = self._behind(total, channel)
+            geometry = self._geometry[self._unit(channel)]
+            square, share, leak = (np.ascontiguousarray(each[part]) for each in geometry)
+            # A mosaic's pixels lie apart in memory, which compiled loops do not take.
+            light_of_channel = np.zeros(square.shape, np.float32)
+            warp.add_flat(square, share, self.angles**2, rates[:, channel], light_of_channel)
+            view += light_of_channel + share * leak * leaking
         return total
 
     def rate(
         self, scene: DataArray, *, distance: float = 300.0, depth: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the photoelectrons per ms of a scene, (rows, columns) float32, without noise."""
+        """Return the photoelectrons per ms of a scene, without noise.
+
+        Returns
+        -------
+        array, (rows, columns) float32; (M, rows, columns) for the exposures of a sequence
+        """
         values = torch.from_numpy(self._values(scene))
         plane = self._disparity(distance, depth, values.shape[:2])
         blur = self._blur(float(np.median(depth)) if depth is not None else distance)
@@ -278,18 +317,52 @@ class Camera:
         transfer = blur.on_grid(size)
         response = torch.from_numpy(self._node_response).float()
         pixels = values.reshape(-1, values.shape[-1])
-        total = np.zeros(self.design.sensor_shape, np.float32)
-        for unit, window in enumerate(self.windows):
-            # What the unit sees of every sample, for each angle and term of the blur: (y, x, A, r).
-            filtered = (response[:, unit, None, :] * blur.weight).flatten(0, 1)
-            seen = (pixels @ filtered.T).view(*values.shape[:2], *blur.weight.shape[:2]).numpy()
-            image = self._project(seen, unit, baselines[unit], plane, margin, transfer, size)
-            total[window] += self._geometry[unit][1] * np.maximum(image, 0)
+
+        def seen(response: Tensor) -> np.ndarray:
+            """What responses (A, K) see of every sample at each angle and term: (y, x, A, r)."""
+            filtered = (response[:, None, :] * blur.weight).flatten(0, 1)
+            return (pixels @ filtered.T).view(*values.shape[:2], *blur.weight.shape[:2]).numpy()
+
+        gap = self.design.filters.gap * torch.from_numpy(self.clear_response).float()
+        leaking = seen(gap.expand(len(response), -1)) if self.design.filters.gap else None
+        total = np.zeros(self._frames, np.float32)
+        for channel in range(self.design.channels):
+            unit = self._unit(channel)
+            light = (seen(response[:, channel]), leaking)
+            image = self._project(light, unit, baselines[unit], plane, margin, transfer, size)
+            view, part = self._behind(total, channel)
+            view += self._geometry[unit][1][part] * np.maximum(image[part], 0)
         return total
+
+    @property
+    def _frames(self) -> tuple[int, ...]:
+        sequence = self.design.filters.layout == "sequential"
+        return (self.design.channels, *self.design.sensor_shape)[not sequence :]
+
+    def _unit(self, channel: int) -> int:
+        """Return the lens before which, or behind which, a filter lies."""
+        return channel if self.design.filters.layout == "array" else 0
+
+    def _behind(self, frames: np.ndarray, channel: int) -> tuple[np.ndarray, tuple[slice, slice]]:
+        """Return a view of the pixels behind a filter, and which of its lens' window they are."""
+        window = self.windows[self._unit(channel)]
+        match self.design.filters.layout:
+            case "sequential":
+                return frames[channel][window], (slice(None), slice(None))
+            case "mosaic":
+                tile = self.design.mosaic
+                rows, columns = (
+                    slice((int(place[0]) - span.start) % period, None, period)
+                    for place, span, period in zip(
+                        np.nonzero(tile == channel), window, tile.shape, strict=True
+                    )
+                )
+                return frames[window][rows, columns], (rows, columns)
+        return frames[window], (slice(None), slice(None))
 
     def _project(
         self,
-        seen: np.ndarray,
+        seen: tuple[np.ndarray, np.ndarray | None],
         unit: int,
         baseline: np.ndarray,
         plane: float | np.ndarray,
@@ -297,7 +370,10 @@ class Camera:
         transfer: Tensor,
         size: tuple[int, int],
     ) -> np.ndarray:
-        """Blur what a unit sees of every scene sample, (y, x, A, r), and lay it on its window."""
+        """Blur what a unit sees of every scene sample, (y, x, A, r), and lay it on its window.
+
+        seen : through the filter, and through the gap beside it where that is clear.
+        """
         start = np.array([part.start for part in self.windows[unit]])
         stop = np.array([part.stop for part in self.windows[unit]])
         rows, columns = stop - start
@@ -305,30 +381,41 @@ class Camera:
         on_axis = start - self.design.centres[unit]
         # Scene position of the window's first pixel, and of the first pixel of the canvas around.
         field = self.design.field.size
-        centre = [_first(field, length) + (field - 1) / 2 for length in seen.shape[:2]]
+        centre = [_first(field, length) + (field - 1) / 2 for length in seen[0].shape[:2]]
         origin = on_axis - middle * baseline + centre
         first = np.floor(origin).astype(int) - margin
         position = on_axis + first - origin
-        canvas = warp.weigh(seen, first, position, self.design.focal, self.angles**2, size)
+        place = (first, position, self.design.focal, self.angles**2, size)
+        canvas = warp.weigh(seen[0], *place)
+        if seen[1] is not None:
+            rows_of_canvas, columns_of_canvas = (
+                at + np.arange(length) for at, length in zip(position, size, strict=True)
+            )
+            leak = self._through(rows_of_canvas, columns_of_canvas)[1]
+            canvas += leak * warp.weigh(seen[1], *place)
         flat = not isinstance(plane, np.ndarray)
         if flat:
-            transfer = transfer * _shift(origin - first, size)
+            transfer = transfer * shift(origin - first, size)
         spectrum = (torch.fft.rfft2(torch.from_numpy(canvas)) * transfer).sum(0)
         image = torch.fft.irfft2(spectrum, s=size).numpy()
         if flat:
             return image[:rows, :columns]
         return warp.relief(image, plane, first, origin, middle, baseline, (rows, columns))
 
-    def _blur(self, distance: float) -> "Blur":
+    def _blur(self, distance: float) -> Blur:
         inner = np.minimum(
             self.angles, self.angles[3]
         )  # outside the field it stays as in its corner
         cycles = np.linspace(0, np.sqrt(0.5), 96)
-        return Blur.of(lens.transfer_function(self.design, inner, distance, cycles), cycles)
+        transfer = lens.transfer_function(self.design, inner, distance, cycles)
+        blur = Blur.of(transfer, cycles)
+        return blur.displaced(lens.lateral_colour(self.design, inner, distance))
 
     @cached_property
-    def _geometry(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Squared field angle and share of light over each unit's window, (H, W) float32."""
+    def _geometry(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Of every pixel of each unit's window, (H, W) float32: the squared field angle, the share
+        of light that comes through the filter, and for how much of it some comes beside it.
+        """
         geometry = []
         for unit, window in enumerate(self.windows):
             rows, columns = (
@@ -336,11 +423,22 @@ class Camera:
                 for part, centre in zip(window, self.design.centres[unit], strict=True)
             )
             tangent = np.hypot(rows[:, None], columns[None, :]) / self.design.focal
-            share = lens.vignetting(self.design, unit, rows, columns)
-            geometry.append(
-                ((np.arctan(tangent) ** 2).astype(np.float32), share.astype(np.float32))
-            )
+            through, leak = self._through(rows, columns)
+            share = lens.vignetting(self.design, unit, rows, columns) * through
+            angle = np.arctan(tangent) ** 2
+            geometry.append((angle.astype(np.float32), share.astype(np.float32), leak))
         return geometry
+
+    def _through(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the share of light through the filter, and the ratio of what misses it to that.
+
+        rows, columns : px against the lens' axis; the result is (H, W) float32.
+        """
+        coarse = [np.linspace(axis[0], axis[-1], 41) for axis in (rows, columns)]
+        table = lens.through_filter(self.design, coarse[0][:, None], coarse[1][None, :])
+        table = resample(table, coarse[1], columns)  # smooth: 41 nodes are plenty
+        through = resample(table.T, coarse[0], rows).T.astype(np.float32)
+        return through, (1 - through) / np.maximum(through, 1e-6)
 
     def _disparity(self, distance: float, depth: np.ndarray | None, shape):
         far = self.design.array.pitch / 1000 * self.design.focal
@@ -374,50 +472,6 @@ class Camera:
         if values.min() < 0:
             raise InputError("The scene holds negative radiance; clip it at zero before capturing.")
         return values
-
-
-@dataclass(frozen=True)
-class Blur:
-    """The blur over angle and wavelength as a sum of a few terms weight(a, k) frequency(f).
-
-    weight : Tensor, (A, r, K).  frequency : (r, F) over `cycles` (F,), cycles per px.
-    """
-
-    weight: Tensor
-    frequency: np.ndarray
-    cycles: np.ndarray
-
-    @classmethod
-    def of(cls, transfer: np.ndarray, cycles: np.ndarray, tolerance: float = 6e-4) -> "Blur":
-        """Separate a transfer function (A, K, F) to a relative tolerance by its SVD.
-
-        Low frequencies weigh more, for pictures are made of them and light must not be lost.
-        """
-        angles, bands, _ = transfer.shape
-        importance = 1 / (cycles + 0.01)
-        left, values, right = np.linalg.svd(
-            (transfer * importance).reshape(angles * bands, -1), False
-        )
-        lost = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1] / np.sum(values**2))
-        rank = max(1, int(np.sum(lost > tolerance)))
-        weight = (left[:, :rank] * values[:rank]).reshape(angles, bands, rank)
-        weight = torch.from_numpy(weight).float().permute(0, 2, 1).contiguous()
-        return cls(weight, right[:rank] / importance, cycles)
-
-    def on_grid(self, size: tuple[int, int]) -> Tensor:
-        """Return each term on the grid of a real FFT, times the pixel's aperture, (r, ...)."""
-        y, x = np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1])[None, :]
-        radius, pixel = np.hypot(y, x), np.sinc(y) * np.sinc(x)
-        terms = np.stack([np.interp(radius, self.cycles, term) for term in self.frequency])
-        return torch.from_numpy(terms * pixel).float()
-
-
-def _shift(offset: np.ndarray, size: tuple[int, int]) -> Tensor:
-    """Return the phase that moves a picture so that position `offset` becomes its first pixel."""
-    y, x = np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1])[None, :]
-    return torch.from_numpy(np.exp(2j * np.pi * (y * offset[0] + x * offset[1]))).to(
-        torch.complex64
-    )
 
 
 def _first(size: int, length: int) -> int:

@@ -3,13 +3,16 @@
 import csv
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+if TYPE_CHECKING:
+    from squilla.camera.design import CameraDesign
+
 
 def camera(
-    design: Annotated[str, typer.Argument(help="thesis, or a TOML file.")] = "thesis",
+    design: Annotated[str, typer.Argument(help="A built-in design, or a TOML file.")] = "thesis",
     toml: Annotated[bool, typer.Option("--toml", help="Print the design to start from.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print every figure as JSON.")] = False,
 ) -> None:
@@ -17,7 +20,7 @@ def camera(
 
     Example: squilla camera thesis --toml > mine.toml; squilla camera mine.toml
     """
-    from squilla.camera.design import CameraDesign, design_path
+    from squilla.camera.design import CameraDesign, design_path, designs
 
     read = CameraDesign.load(design)
     if toml:
@@ -27,26 +30,44 @@ def camera(
         typer.echo(read.model_dump_json(indent=2))
         return
     size, band, sensor = read.field.size, read.band, read.sensor
+    filters, single = read.filters, read.filters.layout != "array"
     rows = {
         "camera": read.name,
-        "units": f"{read.array.rows} x {read.array.columns}, {read.pitch:.1f} px apart",
+        "units": "one lens"
+        if single
+        else f"{read.array.rows} x {read.array.columns}, {read.pitch:.1f} px apart",
         "sub-images": f"{size} x {size} px, {len(read.wavelength)} bands "
         f"{band.start:g}-{band.stop:g} nm",
         "sensor": f"{sensor.columns} x {sensor.rows} px of {sensor.pixel:g} um, {sensor.bits} bit, "
         f"{sensor.gain:.2f} e-/DN",
         "lens": f"f {read.lens.focal_length / 1000:g} mm, "
         f"F/{read.lens.focal_length / read.lens.diameter:g}",
-        "filters": f"{read.filters.recipe} recipe, seed {read.filters.seed}"
-        if read.filters.recipe
-        else f"table {read.filters.table}",
-        "stop": "none: sub-images overlap"
-        if read.stop is None
-        else f"{read.stop.width:g} mm square at {read.stop.distance:g} mm",
+        "filters": f"{read.channels} ({filters.layout}), "
+        + (
+            f"{filters.recipe} recipe, seed {filters.seed}"
+            if filters.recipe
+            else f"table {filters.table}"
+        ),
+        "stop": _barriers(read),
         "effects off": ", ".join(k for k, on in read.effects.model_dump().items() if not on)
         or "none",
+        "built in": ", ".join(designs()),
     }
     for name, value in rows.items():
         typer.echo(f"{name:<12} {value}")
+
+
+def _barriers(design: "CameraDesign") -> str:
+    """Say what keeps the sub-images apart."""
+    stop, walls, barriers = design.stop, design.walls, []
+    if stop is not None:
+        shape = "round" if stop.round else "square"
+        barriers.append(f"{stop.width:g} mm {shape} at {stop.distance:g} mm")
+    if walls is not None:
+        barriers.append(f"walls of {walls.height / 1000:g} mm")
+    if not barriers and design.units > 1:
+        return "none: sub-images overlap"
+    return ", ".join(barriers) or "none needed"
 
 
 def rehearse(

@@ -76,7 +76,12 @@ class MeasuredFilters:
 
 
 def band_pass(
-    filters: int = 36, wavelength: ArrayLike | None = None, *, fwhm: float = 12.0, peak: float = 1.0
+    filters: int = 36,
+    wavelength: ArrayLike | None = None,
+    *,
+    fwhm: float = 12.0,
+    peak: float = 1.0,
+    effective_index: float | None = None,
 ) -> MeasuredFilters:
     """Return ideal band-pass filters, Gaussian in wavelength and side by side over the band.
 
@@ -89,12 +94,14 @@ def band_pass(
         nm.
     peak : float
         Transmittance at the peak, 0..1.
+    effective_index : float, optional
+        For the blue shift at an angle; None: no shift.
     """
     wavelength = grid() if wavelength is None else np.asarray(wavelength, float)
     first, last = wavelength[[0, -1]]
     centre = first + (last - first) * (np.arange(filters) + 0.5) / filters
     distance = (wavelength - centre[:, None]) / fwhm
-    return MeasuredFilters(wavelength, peak * np.exp(-4 * np.log(2) * distance**2))
+    return MeasuredFilters(wavelength, peak * np.exp(-4 * np.log(2) * distance**2), effective_index)
 
 
 # --- files --------------------------------------------------------------------------------------

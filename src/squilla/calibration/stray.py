@@ -1,0 +1,69 @@
+"""Light where no lens should send any: how ghosts from outside the field are noticed.
+
+The aperture stop, or walls, leave the sensor dark beyond the sub-images. What a lens images there
+has come past them, and lands in neighbouring sub-images too, where nothing can tell it from their
+own picture. So the dark parts are watched. A sensor that the sub-images fill to its edges has none,
+and a ghost below `_SHARE` of the signal is not told from glare.
+"""
+
+import numba
+import numpy as np
+
+from squilla.calibration.calibration import DARK_BLOCK as _BLOCK
+from squilla.calibration.calibration import Pixels
+
+_SHARE = 0.02
+"""Stray light that is reported, against the mean signal."""
+
+
+def stray_light(
+    frame: np.ndarray, exposure: float | None, pixels: Pixels, signal: float
+) -> dict[str, float | str]:
+    """Judge the light in the dark parts of a frame.
+
+    Parameters
+    ----------
+    frame : array, (rows, columns) uint16
+        DN.
+    exposure : float, optional
+        ms.
+    pixels : Pixels
+    signal : float
+        Mean signal of the sub-images, DN.
+
+    Returns
+    -------
+    dict
+        stray_light : a sentence; stray_share, stray_peak : mean and brightest of the dark parts
+        against the signal, where there are any.
+    """
+    blocks = pixels.dark_blocks
+    if not len(blocks):
+        return {"stray_light": "not judged: the sub-images leave no part of the sensor dark"}
+    level = np.empty(len(blocks), np.float32)
+    _levels(frame, pixels.bias, pixels.dark_rate, np.float32(exposure or 0.0), blocks, level)
+    share, peak = float(level.mean()) / signal, float(level.max()) / signal
+    noise = np.sqrt((pixels.read_noise / pixels.gain) ** 2 + 1 / 12) / _BLOCK / signal
+    found = {"stray_share": share, "stray_peak": peak}
+    if max(share, peak - 8 * noise) < _SHARE:
+        return found | {"stray_light": "none seen"}
+    return found | {
+        "stray_light": f"Light falls beside the sub-images, {100 * share:.0f} % of the signal on "
+        f"the mean and {100 * peak:.0f} % at the brightest: something outside the field reaches "
+        "the sub-images of neighbouring lenses too; check the aperture stop, or shade it."
+    }
+
+
+@numba.njit(parallel=True, cache=True)
+def _levels(frame, bias, dark_rate, exposure, blocks, level):
+    for number in numba.prange(len(blocks)):
+        y, x = blocks[number]
+        total, highest = np.float32(0), np.float32(-1e9)
+        for row in range(y, y + _BLOCK):
+            for column in range(x, x + _BLOCK):
+                light = np.float32(frame[row, column]) - bias[row, column]
+                light -= exposure * dark_rate[row, column]
+                total += light
+                highest = max(highest, light)
+        # Without the brightest pixel, which may be a hot one.
+        level[number] = (total - highest) / (_BLOCK * _BLOCK - 1)
