@@ -11,7 +11,7 @@ Pictures are (B, H, W, channels); level l has cells of 2^l px.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -199,13 +199,17 @@ def inherit(share: Tensor, coarse: Tensor, own: Tensor) -> Tensor:
     coarse (B, H/2, W/2, C) and own (B, H, W, C) or (C,) -> (B, H, W, C)
     """
     around = _edged(coarse)
-    mixed = share[..., 4:] * own
-    for phase, cells in _four(*share.shape[1:3]):
-        part = mixed[phase]
+    b, h, w, c = coarse.shape
+    own = own.expand(*share.shape[:3], c)
+    phases = []
+    for phase, cells in _four(2 * h, 2 * w):
+        part = share[phase]
+        mixed = part[..., 4:] * own[phase]
         for number, cell in enumerate(cells):
-            part = torch.addcmul(part, share[(*phase, slice(number, number + 1))], around[cell])
-        mixed[phase] = part
-    return mixed
+            mixed = torch.addcmul(mixed, part[..., number : number + 1], around[cell])
+        phases.append(mixed)
+    rows = [torch.stack(phases[2 * row : 2 * row + 2], 3) for row in range(2)]
+    return torch.stack(rows, 2).view(b, 2 * h, 2 * w, c)
 
 
 def _edged(picture: Tensor) -> Tensor:
@@ -387,8 +391,10 @@ class Refiner(nn.Module):
         nn.init.zeros_(self.leave.weight)
         nn.init.zeros_(self.leave.bias)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.leave(self.blocks(self.enter(x)))
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what leaves, and the features before."""
+        x = self.blocks(self.enter(x))
+        return self.leave(x), x
 
 
 class BackEnd(nn.Module):
@@ -413,8 +419,8 @@ class BackEnd(nn.Module):
         self.register_buffer("knots", (average @ prior.basis).float(), persistent=False)
         self.spectral = Refiner(2 * size + 2, widths[0], 4, size + KNOTS)
         self.middle = Refiner(2 * size + 3, widths[1], 2, size + 1)
-        self.fine = Refiner(2 * FINE + 4, widths[2], 2, FINE + 2)
-        self.margin = Refiner(2 * FINE + 4, widths[2], 1, KNOTS, kernel=3)
+        self.fine = Refiner(2 * FINE + 4, widths[2], 1, FINE + 2)
+        self.margin = nn.Sequential(nn.Linear(widths[2], 32), nn.ReLU(), nn.Linear(32, KNOTS))
 
     def forward(self, seen: Evidence, interval: bool = False) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return coefficients (B, H, W, C), amplitude (B, H, W), and the interval at the knots.
@@ -426,7 +432,7 @@ class BackEnd(nn.Module):
         unit = _rms(seen.coefficients / self.scale)
         relative = (seen.coefficients / self.scale / unit).clamp(-10, 10)
         doubt = (deviation / self.scale / unit).clamp_min(1e-6).log()
-        found = self.spectral(torch.cat([relative, doubt, seen.features / 4], -1))
+        found, _ = self.spectral(torch.cat([relative, doubt, seen.features / 4], -1))
         x = seen.coefficients + deviation * found[..., :size]
         width = None
         if interval:
@@ -453,24 +459,28 @@ class BackEnd(nn.Module):
         inputs = [relative, surprise, deviation.log() + 3, share[..., 4:], (unit + 1e-6).log()]
         amplitude = seen.amplitude
         if level == 0:
-            uneven = (seen.amplitude / seen.smooth.clamp_min(1e-30) - 1)[..., None]
-            inputs.append((uneven / deviation).clamp(-10, 10))
+            uneven = (seen.smooth / seen.amplitude.clamp_min(1e-30) - 1)[..., None] / deviation
+            uneven = uneven.clamp(-10, 10)
+            inputs.append(uneven)
         inputs = torch.cat(inputs, -1)
-        found = (self.fine if level == 0 else self.middle)(inputs)
+        found, features = (self.fine if level == 0 else self.middle)(inputs)
         change = deviation * unit * scale * found[..., :used]
         x = x + torch.tanh(found[..., used : used + 1]) * apart
         if level:
             x = x + change
         else:
             x = torch.cat([x[..., :used] + change, x[..., used:]], -1)
-            calm = torch.sigmoid(found[..., -1])
-            amplitude = amplitude + calm * (seen.smooth - amplitude)
+            # Kin are of one colour, not of one brightness: only what noise explains is evened out.
+            # (An amplitude is about a fifth as noisy as a channel.)
+            step = uneven * (-3 * uneven.square()).exp() * deviation
+            calm = torch.sigmoid(found[..., -1:])
+            amplitude = amplitude * (1 + calm * step)[..., 0]
         if width is not None:
             # What a cell knows alone is as doubtful as its distance from the rest, and its noise.
             alone = (apart.square() @ self.knots.square().T + 0.02 * unit.square()).detach()
             width = inherit(share, width.square(), alone).sqrt()
             if level == 0:
-                width = width * self.margin(inputs.detach()).clamp(-4, 3).exp()
+                width = width * self.margin(features.detach()).clamp(-4, 3).exp()
         return x, width, amplitude
 
 
@@ -504,12 +514,24 @@ class Compound(Reconstructor):
 
     def __init__(self, calibration: Calibration, prior: Prior | None = None):
         super().__init__(calibration)
-        self.prior = (broad_prior() if prior is None else prior).on(calibration.wavelength)
+        prior = broad_prior() if prior is None else prior
+        for key, value in prior.tensors().items():  # the file of the weights holds the prior too
+            self.register_buffer(f"prior_{key}", value)
+        self.prior = prior.on(calibration.wavelength)
         hats = _hats(len(self.wavelength))
         self.back = BackEnd(self.prior, hats)
         self.register_buffer("basis", self.prior.basis.T.float(), persistent=False)
         self.register_buffer("hats", hats, persistent=False)
         self._cameras: dict[tuple[bool, ...], tuple[Camera, Camera]] = {}
+
+    @classmethod
+    def for_weights(cls, calibration: Calibration, weights: Mapping[str, Tensor]) -> "Compound":
+        stored = {
+            key.removeprefix("prior_"): value
+            for key, value in weights.items()
+            if key.startswith("prior_")
+        }
+        return cls(calibration, Prior.from_tensors(stored) if "covariance" in stored else None)
 
     def forward(
         self,

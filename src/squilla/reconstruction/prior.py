@@ -19,6 +19,10 @@ from squilla.reconstruction.linear import within_tables
 from squilla.spectra import resample
 
 
+STORED = "weights.prior_"
+"""How the prior's tensors are named in a model file."""
+
+
 @dataclass(frozen=True)
 class Prior:
     """A mixture of Gaussians over the shapes of spectra.
@@ -56,6 +60,7 @@ class Prior:
         """Return the numbers for a file; the covariances as their halves below the diagonal."""
         row, column = torch.tril_indices(*self.moment.shape)
         return {
+            "wavelength": torch.from_numpy(np.asarray(self.wavelength, np.float32)),
             "basis": self.basis.float(),
             "moment": self.moment.float(),
             "share": self.share.float(),
@@ -64,8 +69,9 @@ class Prior:
         }
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor], wavelength: np.ndarray) -> "Prior":
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "Prior":
         """Undo `tensors`."""
+        wavelength = tensors["wavelength"].double().numpy()
         basis, moment, share, mean, half = (
             tensors[name].double() for name in ("basis", "moment", "share", "mean", "covariance")
         )
@@ -81,10 +87,10 @@ def broad_prior() -> Prior:
     """Return the prior that ships, on 500-750 nm; `experiments/train_compound.py` makes it."""
     from safetensors import safe_open
 
-    path = package_files("squilla") / "data" / "weights" / "prior.safetensors"
+    path = package_files("squilla") / "data" / "weights" / "compound.safetensors"
     with safe_open(str(path), "pt") as file:
-        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    return Prior.from_tensors(tensors, tensors["wavelength"].numpy())
+        names = [key for key in file.keys() if key.startswith(STORED)]  # noqa: SIM118
+        return Prior.from_tensors({key.removeprefix(STORED): file.get_tensor(key) for key in names})
 
 
 def fit_prior(

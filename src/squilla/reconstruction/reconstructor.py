@@ -67,6 +67,11 @@ class Reconstructor(nn.Module):
         self.wavelength = calibration.wavelength
         self.provenance: dict[str, Any] = {}
 
+    @classmethod
+    def for_weights(cls, calibration: Calibration, weights: Mapping[str, Tensor]) -> "Reconstructor":
+        """Return a model that these weights fit."""
+        return cls(calibration)
+
     def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None) -> Tensor:
         """Map finite measurements with a maximum of 1, (N, M), to spectra, (N, K).
 
@@ -376,8 +381,8 @@ def _read(path: Path, calibration: Calibration) -> Reconstructor:
         raise foreign from error
     if not model_class(name).universal:
         _check_camera(path, sensitivity, wavelength.numpy(), calibration)
-    model = model_class(name)(calibration)
     weights = {key.removeprefix("weights."): value for key, value in tensors.items()}
+    model = model_class(name).for_weights(calibration, weights)
     expected = model.state_dict()
     if not model.trained or {k: v.shape for k, v in weights.items()} != {
         k: v.shape for k, v in expected.items()

@@ -1,0 +1,66 @@
+"""Train the `compound` model that ships: one model for every camera.
+
+    python experiments/train_compound.py                  # two cores, about an hour
+    python experiments/train_compound.py --steps 60000 --scenes 64 --device cuda --seconds 560
+
+The basis and the mixture of spectra are learnt first (a minute and a half), then the network, on
+random scenes seen by random cameras. Interrupted, or stopped by --seconds, it goes on where it was
+when started again with the same settings. --export writes the weights of the last checkpoint
+without training. The log stands in results/train_compound.jsonl.
+"""
+
+import argparse
+from dataclasses import fields
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+
+import squilla
+from squilla.files.disk import replacing
+from squilla.reconstruction.prior import Prior
+from squilla.spectra import grid
+from squilla.training.compound import Recipe, learn_prior, train_compound
+
+WEIGHTS = Path(squilla.__file__).parent / "data" / "weights" / "compound.safetensors"
+RESULTS = Path(__file__).parent / "results"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Train the compound model that ships.")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after this time")
+    parser.add_argument("--export", action="store_true", help="write the last checkpoint's weights")
+    parser.add_argument("--output", type=Path, default=WEIGHTS)
+    parser.add_argument("--work", type=Path, default=RESULTS, help="folder of log and checkpoint")
+    for field in fields(Recipe):
+        flag = f"--{field.name.replace('_', '-')}"
+        parser.add_argument(flag, type=type(field.default), default=field.default)
+    options = parser.parse_args()
+    recipe = Recipe(**{field.name: getattr(options, field.name) for field in fields(Recipe)})
+
+    options.work.mkdir(parents=True, exist_ok=True)
+    trained = train_compound(
+        grid(),
+        recipe,
+        prior=_prior(options.work / "prior.checkpoint"),
+        device=options.device,
+        log=options.work / "train_compound.jsonl",
+        checkpoint=options.work / "train_compound.checkpoint",
+        seconds=0 if options.export else options.seconds,
+        report=lambda entry: print(entry, flush=True),
+    )
+    trained.save(options.output)
+    print(f"{options.output}: {trained.provenance['trained_steps']} of {recipe.steps} steps")
+
+
+def _prior(path: Path) -> Prior:
+    """Return the prior, learnt only once."""
+    if not path.exists():
+        with replacing(path) as temporary:
+            save_file(learn_prior(grid()).tensors(), temporary)
+    return Prior.from_tensors(load_file(path))
+
+
+if __name__ == "__main__":
+    main()
