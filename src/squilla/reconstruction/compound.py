@@ -11,7 +11,7 @@ Pictures are (B, H, W, channels); level l has cells of 2^l px.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
-from squilla.reconstruction.prior import Estimators, Prior, broad_prior, log_ratio
+from squilla.reconstruction.prior import Estimators, Prior, broad_prior
 from squilla.reconstruction.reconstructor import Reconstructor, Scale, check_scale, picture
 
 if TYPE_CHECKING:
@@ -34,11 +34,14 @@ LEVELS = 4
 SPECTRAL = 2
 """Level at which spectra are inferred; finer ones borrow from it."""
 
-TOLD = 16
-"""Leading eigenvectors by which two measurements are told apart."""
+DIRECTIONS = 32
+"""Directions of the channels that are kept: what others see of spectra is below 60 dB."""
 
-FINE = 24
-"""Leading coefficients that the network corrects at the finest level."""
+TOLD = 12
+"""Leading directions by which two measurements are told apart."""
+
+CORRECTED = (16, 32)
+"""Leading coefficients that cells of levels 0 and 1 know something of by themselves."""
 
 KNOTS = 51
 """Wavelengths at which the interval is predicted; linear in between."""
@@ -71,21 +74,31 @@ class Camera:
         response = response.double()
         mean = response.mean(0)
         white = mean.sum(-1)
-        self.unit = float(white.square().mean().sqrt())
-        """Rms that a flat spectrum of one measures."""
-        self.flat = (white / (white @ white)).float()
-        """(M,), y @ flat is the amplitude of a measurement."""
-        self.zones = [Estimators(one / self.unit, prior) for one in response]
+        flat = white / (white @ white)
+        seen = mean @ prior.basis
+        unit = white.square().mean().sqrt()
+        vectors = torch.linalg.eigh(seen @ prior.moment @ seen.T)[1].flip(1)
+        kept = torch.zeros(len(white), DIRECTIONS, dtype=torch.float64)
+        kept[:, : len(white)] = vectors[:, :DIRECTIONS]
+        self.project = torch.cat([kept / unit, flat[:, None]], 1).float()
+        """(M, DIRECTIONS + 1), y @ project is amplitude times shape in the directions kept, and
+        the amplitude. A flat spectrum of one has an amplitude of one and a shape of rms one."""
+        self.channels = len(white)
+        self.zones = [
+            Estimators(kept.T @ one @ prior.basis / unit, flat @ one @ prior.basis, len(white), prior)
+            for one in response
+        ]
         """The posteriors, zone by zone."""
-        own = self.zones[len(self.zones) // 2].linear
-        self.told, self.power = own.vectors[0, :, :TOLD], own.power[0, 0, :TOLD]
-        """Eigenvectors, (M, TOLD), by which spectra are told apart, and the variance in them."""
-        self.quiet = own.vectors[0, :, -(len(white) // 2) :]
-        """Eigenvectors, (M, M // 2), that hardly any spectrum reaches: what they see is noise."""
+        seen = kept[:, :TOLD].T @ seen / unit
+        moment = prior.moment * (len(white) / (seen @ prior.moment @ seen.T).trace())
+        self.power = (seen @ moment @ seen.T).diagonal().clamp_min(1e-12).float()
+        """(TOLD,), variance of shapes in the leading directions."""
+        self.quiet = vectors[:, -(len(white) // 2) :].float()
+        """(M, M // 2), directions that hardly any spectrum reaches: what they see is noise."""
 
     def to(self, device: torch.device | str) -> "Camera":
         """Move everything to a device, in place."""
-        for name in ("flat", "told", "power", "quiet"):
+        for name in ("project", "power", "quiet"):
             setattr(self, name, getattr(self, name).to(device))
         for zone in self.zones:
             zone.to(device)
@@ -96,30 +109,25 @@ class Camera:
 class View:
     """The measurement at one level: what cells measure, and how sure that is.
 
-    shape : (B, H, W, M) measurements divided by their amplitude and the camera's unit.
-    weight : (B, H, W) one over the noise variance of a channel; 0 where nothing was measured.
+    shape : (B, H, W, D) measurements divided by their amplitude, in the camera's directions.
+    noise : (B, H, W) noise variance of each direction.
     amplitude : (B, H, W).
     """
 
     shape: Tensor
-    weight: Tensor
+    noise: Tensor
     amplitude: Tensor
 
-    @property
-    def noise(self) -> Tensor:
-        """Noise variance with what the calibration is wrong by, (B, H, W)."""
-        return 1 / self.weight.clamp_min(1e-6) + MODEL_NOISE
-
-    def joined(self) -> Tensor:
-        """Return everything that is averaged together, (B, H, W, M + 2)."""
+    def joined(self, size: int) -> Tensor:
+        """Return what is averaged together, (B, H, W, size + 2), of `size` directions."""
         return torch.cat(
-            [self.shape, 1 / self.weight.clamp_min(1e-6)[..., None], self.amplitude[..., None]], -1
+            [self.shape[..., :size], self.noise[..., None], self.amplitude[..., None]], -1
         )
 
     @classmethod
     def parted(cls, joined: Tensor) -> "View":
         """Undo `joined`."""
-        return cls(joined[..., :-2], 1 / joined[..., -2], joined[..., -1])
+        return cls(joined[..., :-2], joined[..., -2], joined[..., -1])
 
 
 # --- averaging over what looks the same ---------------------------------------------------------
@@ -127,38 +135,38 @@ class View:
 
 def coarser(view: View) -> View:
     """Average cells two by two, each weighted by its certainty; sides must be even."""
-    b, h, w, m = view.shape.shape
+    b, h, w, _ = view.shape.shape
 
     def total(values: Tensor) -> Tensor:
         return values.view(b, h // 2, 2, w // 2, 2, -1).sum((2, 4))
 
-    weight = view.weight[..., None]
+    weight = 1 / view.noise[..., None]
     summed = total(weight)
-    safe = summed.clamp_min(1e-12)
-    amplitude = total(view.amplitude[..., None] * weight) / safe
-    return View(total(view.shape * weight) / safe, summed[..., 0], amplitude[..., 0])
+    amplitude = total(view.amplitude[..., None] * weight) / summed
+    return View(total(view.shape * weight) / summed, 1 / summed[..., 0], amplitude[..., 0])
 
 
 def among_neighbours(view: View, camera: Camera) -> View:
     """Average each cell with those of its eight neighbours that show the same spectrum."""
-    b, h, w, m = view.shape.shape
-    told = view.shape @ camera.told
-    features = torch.cat([view.shape, view.amplitude[..., None], told, view.weight[..., None]], -1)
-    around = functional.pad(features, (0, 0, 1, 1, 1, 1))
-    content = features[..., : m + 1]
-    total, weight = content * view.weight[..., None], view.weight.clone()
+    b, h, w, size = view.shape.shape
+    weight = 1 / view.noise
+    told = view.shape[..., :TOLD]
+    # Neighbours are about as noisy as the cell itself.
+    scale, against = _telling(2 * (view.noise + MODEL_NOISE), camera)
+    content = torch.cat([view.shape, view.amplitude[..., None]], -1)
+    around = functional.pad(torch.cat([content, weight[..., None]], -1), (0, 0, 1, 1, 1, 1))
+    total = content * weight[..., None]
     for dy, dx in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
         other = around[:, dy : dy + h, dx : dx + w]
-        noise = view.noise + 1 / other[..., -1].clamp_min(1e-6) + MODEL_NOISE
-        differ = log_ratio((other[..., m + 1 : -1] - told).square(), camera.power, noise)
+        differ = ((other[..., :TOLD] - told).square() * scale).sum(-1) - against
         share = torch.sigmoid(-differ) * other[..., -1]
-        total = total + share[..., None] * other[..., : m + 1]
+        total = torch.addcmul(total, share[..., None], other[..., : size + 1])
         weight = weight + share
-    total = total / weight.clamp_min(1e-12)[..., None]
-    return View(total[..., :m], weight, total[..., m])
+    total = total / weight[..., None]
+    return View(total[..., :size], 1 / weight, total[..., size])
 
 
-def kinship(view: View, own: View, coarse: View, camera: Camera) -> Tensor:
+def kinship(view: View, own: View, coarse: View, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return how much each cell takes from the four coarse cells around it, and from itself.
 
     The likelihoods that a cell shows the spectrum of a coarse one, times how certain that is.
@@ -174,42 +182,55 @@ def kinship(view: View, own: View, coarse: View, camera: Camera) -> Tensor:
 
     Returns
     -------
-    Tensor, (B, H, W, 5), non-negative, summing to 1; the order is that of `inherit`
+    kin : Tensor, (B, H, W, 4)
+        Shares of the coarse cells, summing to 1, in the order of `inherit`.
+    alone : Tensor, (B, H, W)
+        Log odds of the cell itself against all of them.
     """
-    b, h, w, _ = view.shape.shape
-    told, noise = view.shape @ camera.told, view.noise
-    around = _edged(
-        torch.cat([coarse.shape @ camera.told, coarse.noise[..., None]], -1)
-    )
-    logs = told.new_empty(b, h, w, 5)
-    for phase, cells in _four(h, w):
-        for number, cell in enumerate(cells):
-            other = around[cell]
-            differ = log_ratio(
-                (other[..., :-1] - told[phase]).square(), camera.power, noise[phase] + other[..., -1]
-            )
-            logs[(*phase, number)] = -differ - other[..., -1].log()
-    logs[..., 4] = -own.noise.log()
-    return torch.softmax(logs, -1)
-
-
-def inherit(share: Tensor, coarse: Tensor, own: Tensor) -> Tensor:
-    """Mix what coarse cells and the cells themselves say, by the shares of `kinship`.
-
-    coarse (B, H/2, W/2, C) and own (B, H, W, C) or (C,) -> (B, H, W, C)
-    """
-    around = _edged(coarse)
-    b, h, w, c = coarse.shape
-    own = own.expand(*share.shape[:3], c)
+    told = view.shape[..., :TOLD]
+    around = _edged(torch.cat([coarse.shape[..., :TOLD], coarse.noise[..., None]], -1))
+    mean = functional.avg_pool2d(around[..., -1], 2, 1)  # of the four around each corner
     phases = []
-    for phase, cells in _four(2 * h, 2 * w):
-        part = share[phase]
-        mixed = part[..., 4:] * own[phase]
-        for number, cell in enumerate(cells):
-            mixed = torch.addcmul(mixed, part[..., number : number + 1], around[cell])
+    for (y, x), phase, cells in _four(*view.noise.shape[1:]):
+        h, w = coarse.noise.shape[1:]
+        noise = view.noise[phase] + mean[:, y : y + h, x : x + w]
+        scale, against = _telling(noise + 2 * MODEL_NOISE, camera)
+        logs = []
+        for cell in cells:
+            other = around[cell]
+            differ = ((other[..., :-1] - told[phase]).square() * scale).sum(-1) - against
+            logs.append(-differ - (other[..., -1] + MODEL_NOISE).log())
+        logs = torch.stack(logs, -1)
+        alone = -(own.noise[phase] + MODEL_NOISE).log() - torch.logsumexp(logs, -1)
+        phases.append(torch.cat([torch.softmax(logs, -1), alone[..., None]], -1))
+    both = _interleaved(phases)
+    return both[..., :4], both[..., 4]
+
+
+def _telling(noise: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return scale (..., TOLD) and constant (...): how to tell two spectra apart.
+
+    The sum of squared differences times scale, less the constant, is how much likelier two
+    measurements are of different spectra than of one, as a logarithm. `noise` is the variance of
+    their difference.
+
+    Source: Neyman and Pearson; N(0, noise) against N(0, noise + 2 power).
+    """
+    share = 2 * camera.power / noise[..., None]
+    return share / (1 + share) / (2 * noise[..., None]), torch.log1p(share).sum(-1) / 2
+
+
+def inherit(kin: Tensor, coarse: Tensor) -> Tensor:
+    """Mix the four coarse cells around each cell, (B, H, W, 4), (B, H/2, W/2, C) -> (B, H, W, C)."""
+    around = _edged(coarse)
+    phases = []
+    for _, phase, cells in _four(*kin.shape[1:3]):
+        part = kin[phase]
+        mixed = part[..., :1] * around[cells[0]]
+        for number in range(1, 4):
+            mixed = torch.addcmul(mixed, part[..., number : number + 1], around[cells[number]])
         phases.append(mixed)
-    rows = [torch.stack(phases[2 * row : 2 * row + 2], 3) for row in range(2)]
-    return torch.stack(rows, 2).view(b, 2 * h, 2 * w, c)
+    return _interleaved(phases)
 
 
 def _edged(picture: Tensor) -> Tensor:
@@ -219,7 +240,7 @@ def _edged(picture: Tensor) -> Tensor:
 
 
 def _four(height: int, width: int):
-    """Yield the four phases of cells in a coarse one, with their four nearest coarse cells."""
+    """Yield the four phases of cells in a coarse one: number, place, its nearest coarse cells."""
     h, w = height // 2, width // 2
     every = slice(None)
     for y in range(2):
@@ -229,7 +250,14 @@ def _four(height: int, width: int):
                 for row in (y, y + 1)
                 for column in (x, x + 1)
             ]
-            yield (every, slice(y, None, 2), slice(x, None, 2)), near
+            yield (y, x), (every, slice(y, None, 2), slice(x, None, 2)), near
+
+
+def _interleaved(phases: list[Tensor]) -> Tensor:
+    """Undo the parting of a picture into four phases."""
+    b, h, w, c = phases[0].shape
+    rows = [torch.stack(phases[2 * row : 2 * row + 2], 3) for row in range(2)]
+    return torch.stack(rows, 2).view(b, 2 * h, 2 * w, c)
 
 
 # --- the front end ------------------------------------------------------------------------------
@@ -237,20 +265,21 @@ def _four(height: int, width: int):
 
 @dataclass
 class Evidence:
-    """Everything that the front end hands on; a picture's cells at the levels 0, 1, SPECTRAL.
+    """Everything that the front end hands on, of the same size for every camera.
 
-    coefficients, variance : (B, H, W, C) at SPECTRAL, posterior mean and variance.
-    features : (B, H, W, 2) at SPECTRAL: log noise and log evidence.
-    shares : of `kinship` for the levels below SPECTRAL, finest first.
-    own : linear estimates of the levels below SPECTRAL, (B, H, W, C), finest first.
-    noise : noise variance of what each cell there knows alone, finest first.
+    coefficients, variance : (B, H, W, C) at the level SPECTRAL, posterior mean and variance.
+    features : (B, H, W, 2) there: log noise and log evidence.
+    kin, alone : of `kinship` for the levels below, finest first.
+    own : what the cells of these levels say by themselves, (B, H, W, CORRECTED[level]).
+    noise : noise variance of that, (B, H, W).
     amplitude : (B, H, W) as measured; smooth : the same averaged over kin.
     """
 
     coefficients: Tensor
     variance: Tensor
     features: Tensor
-    shares: list[Tensor]
+    kin: list[Tensor]
+    alone: list[Tensor]
     own: list[Tensor]
     noise: list[Tensor]
     amplitude: Tensor
@@ -274,44 +303,59 @@ def gather_evidence(
     zone : Tensor, (B, H, W), int, optional
         Number of each pixel's zone; a camera of one zone needs none.
     """
-    amplitude = y @ camera.flat
+    projected = y @ camera.project
+    amplitude = projected[..., -1]
     floor = 1e-3 * amplitude.abs().mean((1, 2), keepdim=True)
     amplitude = torch.maximum(amplitude, floor).clamp_min(1e-30)
-    shape = y / (camera.unit * amplitude[..., None])
-    noise = ratio * shape.square().mean(-1).clamp_min(1e-6)
-    views = [View(shape, 1 / noise.clamp_min(1e-9), amplitude)]
+    shape = projected[..., :-1] / amplitude[..., None]
+    power = shape.square().sum(-1) / camera.channels
+    views = [View(shape, (ratio * power.clamp_min(1e-6)).clamp(1e-9, 1e6), amplitude)]
     for _ in range(levels):
         views.append(coarser(views[-1]))
     known = [views[0], *(among_neighbours(view, camera) for view in views[1:])]
-    best, shares = known[-1], []
     lowest = min(SPECTRAL, levels)
-    spectral = best
+    best = spectral = known[-1]
+    kin, alone = [], []
     for level in reversed(range(levels)):
-        shares.insert(0, kinship(views[level], known[level], best, camera))
-        best = View.parted(inherit(shares[0], best.joined(), known[level].joined()))
+        shares, odds = kinship(views[level], known[level], best, camera)
+        if level < lowest:
+            kin.insert(0, shares)
+            alone.insert(0, odds)
+        if level == 0:
+            break
+        size = DIRECTIONS if level >= lowest else TOLD
+        inherited = inherit(shares, best.joined(size))
+        itself = torch.sigmoid(odds)[..., None]
+        best = View.parted(torch.lerp(inherited, known[level].joined(size), itself))
         if level == lowest:
             spectral = best
-    zone_at = [_coarse_zone(zone, 2**level) for level in range(lowest + 1)]
-    mean, variance, evidence = _by_zone(
-        lambda one, *given: one.mixture(*given),
-        camera.zones, zone_at[lowest], spectral.shape, spectral.noise,
-    )  # fmt: skip
+    smooth = inherit(kin[0], best.amplitude[..., None])[..., 0] if levels else amplitude
+
+    def estimated(level: int, view: View, estimate):
+        return _by_zone(
+            estimate, camera.zones, _coarse_zone(zone, 2**level), view.shape,
+            view.noise + MODEL_NOISE,
+        )  # fmt: skip
+
+    mean, variance, evidence = estimated(lowest, spectral, Estimators.mixture)
     own = [
-        _by_zone(
-            lambda one, *given: (one.wiener(*given),),
-            camera.zones, zone_at[level], known[level].shape, known[level].noise,
+        estimated(
+            level, known[level],
+            lambda one, shape, noise, size=CORRECTED[level]: (one.wiener(shape, noise, size),),
         )[0]
         for level in range(lowest)
     ]  # fmt: skip
+    noise = (spectral.noise + MODEL_NOISE).log()
     return Evidence(
         mean,
         variance,
-        torch.stack([spectral.noise.log(), evidence.clamp(-20, 20)], -1),
-        shares[:lowest],
+        torch.stack([noise, evidence.clamp(-20, 20)], -1),
+        kin,
+        alone,
         own,
-        [known[level].noise for level in range(lowest)],
+        [known[level].noise + MODEL_NOISE for level in range(lowest)],
         amplitude,
-        best.amplitude if levels else amplitude,
+        smooth,
     )
 
 
@@ -319,7 +363,7 @@ def _coarse_zone(zone: Tensor | None, step: int) -> Tensor | None:
     return None if zone is None else zone[:, step // 2 :: step, step // 2 :: step].contiguous()
 
 
-def _by_zone(estimate, zones: Sequence[Estimators], zone: Tensor | None, shape: Tensor, noise: Tensor):
+def _by_zone(estimate, zones: list[Estimators], zone: Tensor | None, shape: Tensor, noise: Tensor):
     """Apply each zone's estimator to its own cells; returns pictures."""
     grid = noise.shape
     shape, noise = shape.reshape(-1, shape.shape[-1]), noise.reshape(-1)
@@ -344,22 +388,16 @@ def noise_factor(y: Tensor, ratio: Tensor, camera: Camera) -> Tensor:
     the more in directions of the measurement that spectra hardly reach. The median of these
     differences over the picture is not moved by the edges in it.
     """
-    shape = y / (y @ camera.flat).clamp_min(1e-30)[..., None]
-    shape = torch.where(shape.abs() < 1e3, shape, torch.nan)
-    quiet = shape @ camera.quiet
-    power = ratio * shape.square().mean(-1)
-    steps = []
-    for one, other in (
-        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
-        ((slice(None), slice(None), slice(1, None)), (slice(None), slice(None), slice(None, -1))),
-    ):
-        expected = power[one] + power[other]
-        steps.append(((quiet[one] - quiet[other]).square().mean(-1) / expected).flatten(1))
-    found = torch.cat(steps, 1)
-    found = torch.where(found.isfinite(), found, torch.nan)
+    y, ratio = y[:, ::2], ratio[:, ::2]  # every other row is plenty
+    amplitude = (y @ camera.project[:, -1:]).clamp_min(1e-30)
+    quiet = (y @ camera.quiet) / amplitude
+    power = ratio * (y / amplitude).square().mean(-1)
+    expected = power[:, :, 1:] + power[:, :, :-1]
+    steps = (quiet[:, :, 1:] - quiet[:, :, :-1]).square().mean(-1) / expected
+    steps = torch.where(expected < 1e6, steps, torch.nan).flatten(1)
     count = camera.quiet.shape[1]
     # Wilson and Hilferty: the median of a mean of `count` squares.
-    factor = found.nanmedian(1).values / (1 - 2 / (9 * count)) ** 3
+    factor = steps.nanmedian(1).values / (1 - 2 / (9 * count)) ** 3
     return factor.nan_to_num(1.0).clamp(0.05, 20.0)[:, None, None]
 
 
@@ -412,15 +450,16 @@ class BackEnd(nn.Module):
 
     def __init__(self, prior: Prior, hats: Tensor):
         super().__init__()
-        widths = (128, 64, 32)
         size = len(prior.moment)
         self.register_buffer("scale", prior.moment.diagonal().sqrt().float(), persistent=False)
         average = hats.double() / hats.double().sum(1, keepdim=True)
         self.register_buffer("knots", (average @ prior.basis).float(), persistent=False)
-        self.spectral = Refiner(2 * size + 2, widths[0], 4, size + KNOTS)
-        self.middle = Refiner(2 * size + 3, widths[1], 2, size + 1)
-        self.fine = Refiner(2 * FINE + 4, widths[2], 1, FINE + 2)
-        self.margin = nn.Sequential(nn.Linear(widths[2], 32), nn.ReLU(), nn.Linear(32, KNOTS))
+        fine, middle = CORRECTED
+        self.spectral = Refiner(2 * size + 2, 96, 3, size + KNOTS)
+        self.finer = nn.ModuleList(
+            [Refiner(2 * fine + 4, 24, 1, fine + 2), Refiner(2 * middle + 4, 48, 1, middle + 2)]
+        )
+        self.margin = nn.Sequential(nn.Linear(24, 32), nn.ReLU(), nn.Linear(32, KNOTS))
 
     def forward(self, seen: Evidence, interval: bool = False) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return coefficients (B, H, W, C), amplitude (B, H, W), and the interval at the knots.
@@ -430,58 +469,60 @@ class BackEnd(nn.Module):
         size = len(self.scale)
         deviation = seen.variance.sqrt()
         unit = _rms(seen.coefficients / self.scale)
-        relative = (seen.coefficients / self.scale / unit).clamp(-10, 10)
-        doubt = (deviation / self.scale / unit).clamp_min(1e-6).log()
+        relative = (seen.coefficients / (self.scale * unit)).clamp(-10, 10)
+        doubt = (deviation / (self.scale * unit)).clamp_min(1e-6).log()
         found, _ = self.spectral(torch.cat([relative, doubt, seen.features / 4], -1))
         x = seen.coefficients + deviation * found[..., :size]
         width = None
         if interval:
             # Diagonal in the coefficients, where the posterior is not: the network knows better.
-            spread = (seen.variance.detach() @ self.knots.square().T).sqrt()
+            spread = (seen.variance @ self.knots.square().T).sqrt()
             width = 1.645 * spread * found[..., size:].clamp(-4, 3).exp()
+        amplitude = seen.amplitude
         for level in reversed(range(len(seen.own))):
-            x, width, amplitude = self._finer(seen, level, x, width)
-        if not seen.own:
-            amplitude = seen.amplitude
+            x, width, calm = self._finer(seen, level, x, width)
+            if level == 0:
+                amplitude = amplitude * (1 + calm)
         return x, amplitude, width
 
     def _finer(self, seen: Evidence, level: int, x: Tensor, width: Tensor | None):
         """Go from the cells of one level to those of the next finer."""
-        share, own, noise = seen.shares[level], seen.own[level], seen.noise[level]
-        x = inherit(share, x, own)
-        scale = self.scale if level else self.scale[:FINE]
-        used = len(scale)
-        unit = _rms(x[..., :used] / scale)
+        own, noise = seen.own[level], seen.noise[level]
+        used = own.shape[-1]
+        x = inherit(seen.kin[level], x)
+        low, scale = x[..., :used].clone(), self.scale[:used]
+        unit = _rms(low / scale)
+        scale = scale * unit
         deviation = noise.sqrt()[..., None]
-        apart = own - x
-        relative = (x[..., :used] / (scale * unit)).clamp(-10, 10)
-        surprise = (apart[..., :used] / (scale * unit * deviation.clamp_min(0.02))).clamp(-10, 10)
-        inputs = [relative, surprise, deviation.log() + 3, share[..., 4:], (unit + 1e-6).log()]
-        amplitude = seen.amplitude
+        odds = seen.alone[level][..., None]
+        apart = own - low
+        uneven = torch.zeros_like(odds)
         if level == 0:
-            uneven = (seen.smooth / seen.amplitude.clamp_min(1e-30) - 1)[..., None] / deviation
+            uneven = (seen.smooth / seen.amplitude - 1)[..., None] / deviation
             uneven = uneven.clamp(-10, 10)
-            inputs.append(uneven)
-        inputs = torch.cat(inputs, -1)
-        found, features = (self.fine if level == 0 else self.middle)(inputs)
-        change = deviation * unit * scale * found[..., :used]
-        x = x + torch.tanh(found[..., used : used + 1]) * apart
-        if level:
-            x = x + change
-        else:
-            x = torch.cat([x[..., :used] + change, x[..., used:]], -1)
-            # Kin are of one colour, not of one brightness: only what noise explains is evened out.
-            # (An amplitude is about a fifth as noisy as a channel.)
-            step = uneven * (-3 * uneven.square()).exp() * deviation
-            calm = torch.sigmoid(found[..., -1:])
-            amplitude = amplitude * (1 + calm * step)[..., 0]
+        inputs = [
+            (low / scale).clamp(-10, 10),
+            (apart / (scale * deviation.clamp_min(0.02))).clamp(-10, 10),
+            deviation.log() + 3,
+            odds.clamp(-10, 10) / 4,
+            unit.log(),
+            uneven,
+        ]
+        found, features = self.finer[level](torch.cat(inputs, -1))
+        itself = torch.sigmoid(odds + found[..., used : used + 1])
+        x[..., :used] = low + itself * apart + deviation * scale * found[..., :used]
         if width is not None:
-            # What a cell knows alone is as doubtful as its distance from the rest, and its noise.
-            alone = (apart.square() @ self.knots.square().T + 0.02 * unit.square()).detach()
-            width = inherit(share, width.square(), alone).sqrt()
+            # What a cell says by itself is as doubtful as its distance from the rest, and its noise.
+            knots = self.knots[:, :used].square().T
+            surprise = apart.square() @ knots + 0.02 * unit.square()
+            kin = inherit(seen.kin[level], width.square())
+            width = torch.lerp(kin, surprise.detach(), itself.detach()).sqrt()
             if level == 0:
                 width = width * self.margin(features.detach()).clamp(-4, 3).exp()
-        return x, width, amplitude
+        # Kin are of one colour, not of one brightness: only what noise explains is evened out. (An
+        # amplitude is about a fifth as noisy as a channel.)
+        step = uneven * (-3 * uneven.square()).exp() * deviation
+        return x, width, (torch.sigmoid(found[..., -1:]) * step)[..., 0]
 
 
 def _rms(x: Tensor) -> Tensor:

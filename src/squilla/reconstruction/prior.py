@@ -175,6 +175,12 @@ def fit_mixture(points: Tensor, clusters: int, *, rounds: int = 40) -> tuple[Ten
 
 # --- posteriors ---------------------------------------------------------------------------------
 
+LEADING = 16
+"""Coefficients for which the clusters' disagreement counts in the variance."""
+
+_NODES = torch.arange(13)
+"""Noise variances between which tables are interpolated: 10^-5 to 10, two to a decade."""
+
 
 class Estimators:
     """The posteriors that a prior and one response matrix imply, ready for any noise.
@@ -183,25 +189,45 @@ class Estimators:
     independent components of variance L + noise; so the estimators of any noise differ by a
     division alone.
 
-    response : (M, K) float64, scaled so that a shape of all ones measures an rms of 1.
+    Parameters
+    ----------
+    seen : Tensor, (D, C), float64
+        What the basis measures, in D orthogonal directions of the channels.
+    amplitude : Tensor, (C,), float64
+        The functional of the coefficients that measured shapes are divided by.
+    channels : int
+        M; measured shapes have a mean power of about one over the channels.
+    prior : Prior
     """
 
-    def __init__(self, response: Tensor, prior: Prior):
-        seen = response @ prior.basis
-        power = (seen @ prior.moment @ seen.T).diagonal().mean()
-        zero = torch.zeros_like(prior.mean[:1])
-        # Measured shapes have a power of about one by their scale, so the estimator's have, too.
-        self.linear = _Gaussians(seen, zero, prior.moment[None] / power)
-        # Shapes are known up to a factor: what the amplitude is taken from is noisy itself.
-        doubt = 0.1**2 * prior.mean[:, :, None] * prior.mean[:, None, :]
-        self.clusters = _Gaussians(seen, prior.mean, prior.covariance + doubt)
-        self.log_share = prior.share.log().float()
+    def __init__(self, seen: Tensor, amplitude: Tensor, channels: int, prior: Prior):
+        moment = prior.moment * (channels / (seen @ prior.moment @ seen.T).trace())
+        self.power, self.vectors, self.gain = _eigen(seen, moment)
+        # A camera may be blind to much of a cluster: its shapes are those of amplitude one.
+        unit = 1 / (prior.mean @ amplitude).clamp_min(0.2)
+        mean = prior.mean * unit[:, None]
+        covariance = prior.covariance * unit.square()[:, None, None]
+        # Amplitudes are noisy themselves, so shapes are known up to a factor.
+        covariance = covariance + 0.1**2 * mean[:, :, None] * mean[:, None, :]
+        power, vectors, gain = _eigen(seen, covariance)  # (G, D), (G, D, D), (G, D, C)
+        self.mean = mean.float()
+        self.cluster_power = power.float()
+        self.cluster_gain = gain.float()
+        self.scores = vectors.permute(1, 0, 2).flatten(1).float()  # (D, G D)
+        self.offset = torch.einsum("gd,gde->ge", mean @ seen.T, vectors).flatten().float()
+        total = power + 10 ** (_NODES.double() / 2 - 5)[:, None, None]  # (J, G, D)
+        self.log_share = (prior.share.log() - total.log().sum(-1) / 2).float()  # (J, G)
+        prior_variance = covariance.diagonal(dim1=-2, dim2=-1)
+        within = prior_variance - torch.einsum("jgd,gdc->jgc", 1 / total, gain.square())
+        self.within = within.clamp_min(1e-10).flatten(0, 1).float()  # (J G, C)
+        self.power, self.vectors, self.gain = (
+            value.float() for value in (self.power, self.vectors, self.gain)
+        )
 
     def to(self, device: torch.device | str) -> "Estimators":
         """Move all matrices to a device, in place."""
-        self.linear.to(device)
-        self.clusters.to(device)
-        self.log_share = self.log_share.to(device)
+        for name, value in vars(self).items():
+            setattr(self, name, value.to(device))
         return self
 
     def mixture(self, shape: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -209,77 +235,37 @@ class Estimators:
 
         Parameters
         ----------
-        shape : Tensor, (N, M)
+        shape : Tensor, (N, D)
             Measured shapes.
         noise : Tensor, (N,)
             Noise variance of each.
 
         Returns
         -------
-        mean (N, C), variance (N, C), log evidence (N,) per channel
+        mean (N, C), variance (N, C), log evidence (N,) per direction
         """
-        own = self.clusters
-        score = (shape - own.seen) @ own.vectors  # (G, N, M)
-        precision = 1 / (own.power + noise[:, None])
-        logs = self.log_share[:, None] + (precision.log() - score.square() * precision).sum(-1) / 2
-        weight = torch.softmax(logs, 0)[..., None]
-        estimate = own.mean + (score * precision) @ own.gain
-        mean = (weight * estimate).sum(0)
-        within = own.variance - precision @ own.gain.square()
-        variance = (weight * (within + (estimate - mean).square())).sum(0)
-        return mean, variance.clamp_min(1e-10), torch.logsumexp(logs, 0) / shape.shape[-1]
+        count, (clusters, size) = len(shape), self.cluster_power.shape
+        score = (shape @ self.scores - self.offset).view(count, clusters, size)
+        scaled = score / (self.cluster_power + noise[:, None, None])
+        place = (noise.log10() * 2 + 10).clamp(0, len(_NODES) - 1)
+        node = torch.relu(1 - (place[:, None] - _NODES.to(noise.device)).abs())  # (N, J)
+        logs = node @ self.log_share - (score * scaled).sum(-1) / 2
+        weight = torch.softmax(logs, 1)
+        each = torch.bmm(scaled.transpose(0, 1), self.cluster_gain[..., :LEADING])
+        each = each.transpose(0, 1) + self.mean[:, :LEADING]
+        scaled = (scaled * weight[..., None]).flatten(1)
+        mean = torch.addmm(weight @ self.mean, scaled, self.cluster_gain.flatten(0, 1))
+        variance = (node[:, :, None] * weight[:, None]).flatten(1) @ self.within
+        apart = (each - mean[:, None, :LEADING]).square()
+        variance[:, :LEADING] += (weight[:, None] @ apart)[:, 0]
+        return mean, variance, torch.logsumexp(logs, 1) / size
 
-    def wiener(self, shape: Tensor, noise: Tensor) -> Tensor:
-        """Return the best linear estimate of the coefficients, (N, M) and (N,) -> (N, C)."""
-        own = self.linear
-        score = shape @ own.vectors[0]
-        return (score / (own.power[0] + noise[:, None])) @ own.gain[0]
-
-    def wiener_variance(self, noise: Tensor) -> Tensor:
-        """Return the error variance of `wiener`, (N,) -> (N, C)."""
-        own = self.linear
-        precision = 1 / (own.power[0] + noise[:, None])
-        return (own.variance[0] - precision @ own.gain[0].square()).clamp_min(1e-10)
+    def wiener(self, shape: Tensor, noise: Tensor, size: int) -> Tensor:
+        """Return the best linear estimate of the first coefficients, (N, D), (N,) -> (N, size)."""
+        return (shape @ self.vectors / (self.power + noise[:, None])) @ self.gain[:, :size]
 
 
-class _Gaussians:
-    """Gaussians of coefficients as a camera sees them, in their eigenvectors; G in front."""
-
-    def __init__(self, seen: Tensor, mean: Tensor, covariance: Tensor):
-        power, vectors = torch.linalg.eigh(seen @ covariance @ seen.T)
-        self.power = power.flip(-1).clamp_min(0)[:, None].float()  # (G, 1, M), largest first
-        self.vectors = vectors.flip(-1).float()  # (G, M, M)
-        self.gain = (vectors.flip(-1).mT @ seen @ covariance).float()  # (G, M, C)
-        self.mean = mean[:, None].float()  # (G, 1, C)
-        self.seen = (mean @ seen.T)[:, None].float()  # (G, 1, M)
-        self.variance = covariance.diagonal(dim1=-2, dim2=-1)[:, None].float()  # (G, 1, C)
-
-    def to(self, device: torch.device | str) -> None:
-        for name, value in vars(self).items():
-            setattr(self, name, value.to(device))
-
-
-def log_ratio(square: Tensor, power: Tensor, noise: Tensor) -> Tensor:
-    """Return how much likelier two measurements are of different spectra than of one, log.
-
-    Parameters
-    ----------
-    square : Tensor, (..., D)
-        Squared differences in the leading eigenvectors of the linear estimator.
-    power : Tensor, (D,)
-        Variance of one measurement in them, without noise.
-    noise : Tensor, (...)
-        Noise variance of the difference.
-
-    Returns
-    -------
-    Tensor, (...)
-
-    Source: Neyman and Pearson; N(0, noise) against N(0, noise + 2 power).
-    """
-    noise = noise[..., None]
-    either = noise + 2 * power
-    evidence = square * (1 / noise - 1 / either) - (either / noise).log()
-    return evidence.sum(-1) / 2
-
-
+def _eigen(seen: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return eigenvalues, eigenvectors and gains of Gaussians as a camera sees them."""
+    power, vectors = torch.linalg.eigh(seen @ covariance @ seen.T)
+    return power.clamp_min(0), vectors, vectors.mT @ seen @ covariance

@@ -60,10 +60,14 @@ def _sinusoids(filters: int, wavelength: np.ndarray, generator: Generator) -> Te
 
 
 def _sensor(wavelength: np.ndarray, generator: Generator) -> Tensor:
-    """Draw a smooth quantum efficiency, (K,)."""
-    knots = torch.rand(4, generator=generator).numpy()
+    """Draw a smooth quantum efficiency, (K,); one camera in six is blind at one end of the band."""
+    levels, cut = torch.rand(4, generator=generator).numpy(), torch.rand(3, generator=generator)
     place = (wavelength - wavelength[0]) / np.ptp(wavelength)
-    levels = 0.25 + 0.75 * knots
-    return torch.from_numpy(np.interp(place, np.linspace(0, 1, 4), levels)).float()
+    curve = np.interp(place, np.linspace(0, 1, 4), 0.25 + 0.75 * levels)
+    if cut[0] < 1 / 6:
+        end = 0.4 + 0.5 * float(cut[1])
+        edge = (place if cut[2] < 0.7 else 1 - place) - end
+        curve = curve / (1 + np.exp(np.clip(edge / 0.02, -50, 50)))
+    return torch.from_numpy(curve).float()
 
 

@@ -36,6 +36,9 @@ SIZE = 64
 PIXELS = 768
 """Pixels of each scene that are compared with the truth."""
 
+SINGLE = 64
+"""Pixels of each scene that are also reconstructed alone."""
+
 NOISE = (10.0, 45.0)
 """Signal-to-noise ratios of scenes, dB."""
 
@@ -53,7 +56,7 @@ class Recipe:
     learning_rate : at its highest; it rises over 100 steps and falls along half a cosine.
     """
 
-    steps: int = 3500
+    steps: int = 4000
     scenes: int = 8
     cameras: int = 4
     arrays: int = 400
@@ -61,16 +64,16 @@ class Recipe:
     seed: int = 0
 
 
-def learn_prior(wavelength: np.ndarray, *, count: int = 40_000, seed: int = 0) -> Prior:
+def learn_prior(wavelength: np.ndarray, *, count: int = 30_000, seed: int = 0) -> Prior:
     """Learn the prior of `Compound` on a grid, from spectra that the palette paints with."""
     palette = Palette(wavelength, seed=seed, count=round(0.25 * count))
     generator = Generator().manual_seed(seed)
     lamp = (torch.rand(round(0.6 * count), generator=generator) * len(palette.lamp)).long()
     natural = palette.natural(lamp, generator)
     families = {
-        "natural": (natural / natural.amax(-1, keepdim=True), 18),
-        "gaussian": (palette.gaussian, 8),
-        "line": (palette.line[: round(0.15 * count)], 8),
+        "natural": (natural / natural.amax(-1, keepdim=True), 14),
+        "gaussian": (palette.gaussian, 6),
+        "line": (palette.line[: round(0.15 * count)], 6),
     }
     return fit_prior(families, wavelength)
 
@@ -124,7 +127,8 @@ class Studio:
         ):
             response, camera = self.camera(int(number))
             some = Scenes(*(getattr(scenes, field.name)[part] for field in fields(Scenes)))
-            y = _misaligned(some.measured(response), generator)
+            shaken = torch.rand(len(part), 1, 1, generator=generator, device=self.device) < 0.3
+            y = misaligned(some.measured(response), 0.25 * shaken, generator)
             y, ratio = self._noisy(y, generator)
             stated = ratio * 10 ** (0.2 * torch.randn(len(y), 1, 1, generator=generator, device=y.device))
             stated = stated * noise_factor(y, stated, camera)
@@ -152,16 +156,15 @@ class Studio:
         return y + (ratio * power).sqrt()[..., None] * noise, ratio.clamp_max(10.0)
 
 
-SINGLE = 64
-"""Pixels of each scene that are also reconstructed alone."""
+def misaligned(y: Tensor, deviation: float | Tensor, generator: Generator) -> Tensor:
+    """Displace every channel of pictures, (B, H, W, M), by a random fraction of a pixel.
 
-
-def _misaligned(y: Tensor, generator: Generator) -> Tensor:
-    """Displace the channels of three pictures in ten by about 0.2 px each, all differently."""
+    deviation : standard deviation along rows and columns, px; one for all, or (B, 1, 1).
+    """
     count, _, _, m = y.shape
     device = y.device
-    amount = 0.25 * (torch.rand(count, 1, 1, generator=generator, device=device) < 0.3)
-    by = amount * torch.randn(count, m, 2, generator=generator, device=device)
+    by = deviation * torch.randn(count, m, 2, generator=generator, device=device)
+    by = by.clamp(-1, 1)
     grid = torch.arange(-1, 2, device=device)
     taps = (1 - (grid - by[..., None]).abs()).clamp_min(0)  # (count, M, 2, 3), bilinear
     kernel = taps[:, :, 0, :, None] * taps[:, :, 1, None, :]
