@@ -38,6 +38,7 @@ from squilla.training.scenes import Palette, draw_scenes
 RESULTS = Path(__file__).parents[1] / "experiments" / "results" / "accuracy.json"
 WAVELENGTH = grid()
 SAMPLE = 3000
+PICTURES = ("indian-pines", "corn-kernel")
 ANGLES = np.radians([0.0, 4.64, 6.57, 8.04, 9.29])
 
 
@@ -137,7 +138,7 @@ def cases(quick: bool) -> list[Case]:
     rows = [case(f"chart, {snr} dB", home, chart, snr) for snr in (15, 20, 30, 40)]
     lines = line_chart()[0]
     rows += [case(f"lines of 1-30 nm, {snr} dB", home, lines, snr) for snr in (20, 30)]
-    rows += [case(f"{name}, 30 dB", home, scene(name), 30) for name in ("indian-pines", "corn-kernel")]
+    rows += [case(f"{name}, 30 dB", home, scene(name), 30) for name in PICTURES]
     rows += [case(f"unseen textures {n}, 20 dB", home, textures(n), 20) for n in (1, 2, 3)]
     rows += [
         case(f"unseen array {n}, chart 20 dB", random_array(1000 + n), chart, 20)

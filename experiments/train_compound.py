@@ -10,6 +10,7 @@ without training. The log stands in results/train_compound.jsonl.
 """
 
 import argparse
+import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -18,9 +19,10 @@ from safetensors.torch import load_file, save_file
 
 import squilla
 from squilla.files.disk import replacing
+from squilla.optics.filters import StencilRecipe
 from squilla.reconstruction.prior import Prior
 from squilla.spectra import grid
-from squilla.training.compound import Recipe, learn_prior, train_compound
+from squilla.training.compound import Recipe, from_checkpoint, learn_prior, train_compound
 
 WEIGHTS = Path(squilla.__file__).parent / "data" / "weights" / "compound.safetensors"
 RESULTS = Path(__file__).parent / "results"
@@ -33,22 +35,31 @@ def main() -> None:
     parser.add_argument("--export", action="store_true", help="write the last checkpoint's weights")
     parser.add_argument("--output", type=Path, default=WEIGHTS)
     parser.add_argument("--work", type=Path, default=RESULTS, help="folder of log and checkpoint")
+    parser.add_argument("--array", type=int, help="train for this one random array alone")
     for field in fields(Recipe):
         flag = f"--{field.name.replace('_', '-')}"
         parser.add_argument(flag, type=type(field.default), default=field.default)
     options = parser.parse_args()
     recipe = Recipe(**{field.name: getattr(options, field.name) for field in fields(Recipe)})
 
+    array = None
+    if options.array is not None:
+        response = StencilRecipe().draw(options.array).transmittance(grid()).numpy()
+        array = squilla.Calibration.from_sensitivity(response, grid())
     options.work.mkdir(parents=True, exist_ok=True)
+    checkpoint = options.work / "train_compound.checkpoint"
+    if options.export:
+        from_checkpoint(checkpoint, _prior(options.work / "prior.checkpoint")).save(options.output)
+        return
     trained = train_compound(
-        grid(),
+        array,
         recipe,
         prior=_prior(options.work / "prior.checkpoint"),
         device=options.device,
         log=options.work / "train_compound.jsonl",
-        checkpoint=options.work / "train_compound.checkpoint",
-        seconds=0 if options.export else options.seconds,
-        report=lambda entry: print(entry, flush=True),
+        checkpoint=checkpoint,
+        seconds=options.seconds,
+        progress=sys.stdout.isatty(),
     )
     trained.save(options.output)
     print(f"{options.output}: {trained.provenance['trained_steps']} of {recipe.steps} steps")

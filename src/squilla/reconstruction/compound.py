@@ -85,8 +85,7 @@ class Camera:
         the amplitude. A flat spectrum of one has an amplitude of one and a shape of rms one."""
         self.channels = len(white)
         self.zones = [
-            Estimators(kept.T @ one @ prior.basis / unit, flat @ one @ prior.basis, len(white), prior)
-            for one in response
+            Estimators(kept.T @ one / unit, flat @ one, len(white), prior) for one in response
         ]
         """The posteriors, zone by zone."""
         seen = kept[:, :TOLD].T @ seen / unit
@@ -148,7 +147,7 @@ def coarser(view: View) -> View:
 
 def among_neighbours(view: View, camera: Camera) -> View:
     """Average each cell with those of its eight neighbours that show the same spectrum."""
-    b, h, w, size = view.shape.shape
+    h, w, size = view.shape.shape[1:]
     weight = 1 / view.noise
     told = view.shape[..., :TOLD]
     # Neighbours are about as noisy as the cell itself.
@@ -221,7 +220,7 @@ def _telling(noise: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def inherit(kin: Tensor, coarse: Tensor) -> Tensor:
-    """Mix the four coarse cells around each cell, (B, H, W, 4), (B, H/2, W/2, C) -> (B, H, W, C)."""
+    """Mix the four coarse cells, (B, H/2, W/2, C), around each cell, (B, H, W, 4)."""
     around = _edged(coarse)
     phases = []
     for _, phase, cells in _four(*kin.shape[1:3]):
@@ -461,7 +460,9 @@ class BackEnd(nn.Module):
         )
         self.margin = nn.Sequential(nn.Linear(24, 32), nn.ReLU(), nn.Linear(32, KNOTS))
 
-    def forward(self, seen: Evidence, interval: bool = False) -> tuple[Tensor, Tensor, Tensor | None]:
+    def forward(
+        self, seen: Evidence, interval: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return coefficients (B, H, W, C), amplitude (B, H, W), and the interval at the knots.
 
         The interval is half the width of the 90 % interval, (B, H, W, KNOTS), for amplitude 1.
@@ -512,7 +513,7 @@ class BackEnd(nn.Module):
         itself = torch.sigmoid(odds + found[..., used : used + 1])
         x[..., :used] = low + itself * apart + deviation * scale * found[..., :used]
         if width is not None:
-            # What a cell says by itself is as doubtful as its distance from the rest, and its noise.
+            # What a cell says by itself is as doubtful as its distance from the rest, and noise.
             knots = self.knots[:, :used].square().T
             surprise = apart.square() @ knots + 0.02 * unit.square()
             kin = inherit(seen.kin[level], width.square())
@@ -616,8 +617,12 @@ class Compound(Reconstructor):
     def reconstruct_interval(self, measurement: Measurement) -> "tuple[DataArray, DataArray]":
         """Return the cube of `reconstruct` and half the width of its 90 % interval."""
         with torch.inference_mode():
-            cubes = self._spectra(*self._usable(measurement), interval=True)
-        both = [self._labelled(cube.cpu().numpy(), measurement, "consistent") for cube in cubes]
+            cube, width = self._spectra(*self._usable(measurement), interval=True)
+        assert width is not None
+        both = [
+            self._labelled(values.cpu().numpy(), measurement, "consistent")
+            for values in (cube, width)
+        ]
         both[1].attrs["long_name"] = "half width of the 90 % interval of the photon radiance"
         return both[0], both[1].rename("interval")
 
@@ -671,14 +676,12 @@ class Compound(Reconstructor):
         interval: bool = False,
     ) -> tuple[Tensor, Tensor | None]:
         """Reconstruct accepted measurements, and the interval if wanted."""
-        *many, height, width, m = (len(y.reshape(-1, y.shape[-1])), 1, 1, y.shape[-1])
-        if y.ndim > 2:
-            *many, height, width, m = y.shape
+        height, width = y.shape[-3:-1] if y.ndim > 2 else (1, 1)
         pixels, bands = y.shape[:-1], len(self.wavelength)
         if y.numel() == 0:
             return y.new_zeros(*pixels, bands), y.new_zeros(*pixels, bands) if interval else None
         camera = self._camera(channels, angle is not None)
-        y = y.reshape(-1, height, width, m)
+        y = y.reshape(-1, height, width, y.shape[-1])
         ratio = 10 ** (-(y.new_tensor(UNKNOWN) if snr is None else snr).clamp_max(60) / 10)
         ratio = ratio.expand(pixels).reshape(y.shape[:-1])
         zone = None
@@ -693,11 +696,9 @@ class Compound(Reconstructor):
             )
             for some in torch.arange(len(y), device=y.device).split(size)
         ]
-        x, spread = (
-            None if part[0] is None else torch.cat(part).view(*pixels, bands)
-            for part in zip(*parts, strict=True)
-        )
-        return x, spread
+        x = torch.cat([part[0] for part in parts]).view(*pixels, bands)
+        spreads = [part[1] for part in parts if part[1] is not None]
+        return x, torch.cat(spreads).view(*pixels, bands) if interval else None
 
     def _pictures(
         self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None, interval: bool

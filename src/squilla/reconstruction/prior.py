@@ -18,7 +18,6 @@ from torch import Tensor
 from squilla.reconstruction.linear import within_tables
 from squilla.spectra import resample
 
-
 STORED = "weights.prior_"
 """How the prior's tensors are named in a model file."""
 
@@ -153,6 +152,7 @@ def fit_mixture(points: Tensor, clusters: int, *, rounds: int = 40) -> tuple[Ten
     responsible = torch.nn.functional.one_hot(belongs, clusters).double()
     whole = torch.cov(points.T)
     ridge = 1e-6 * whole.diagonal().mean() * torch.eye(points.shape[1], dtype=points.dtype)
+    share, mean, covariance = responsible.mean(0), points[:clusters], []
     for _ in range(rounds):
         count = responsible.sum(0) + 1e-9
         mean = responsible.T @ points / count[:, None]
@@ -170,7 +170,8 @@ def fit_mixture(points: Tensor, clusters: int, *, rounds: int = 40) -> tuple[Ten
             )
             covariance.append(spread)
         responsible = torch.softmax(torch.stack(logs, 1), 1)
-    return count / len(points), mean, torch.stack(covariance)
+        share = count / len(points)
+    return share, mean, torch.stack(covariance)
 
 
 # --- posteriors ---------------------------------------------------------------------------------
@@ -191,16 +192,17 @@ class Estimators:
 
     Parameters
     ----------
-    seen : Tensor, (D, C), float64
-        What the basis measures, in D orthogonal directions of the channels.
-    amplitude : Tensor, (C,), float64
-        The functional of the coefficients that measured shapes are divided by.
+    response : Tensor, (D, K), float64
+        Of the camera, in D orthogonal directions of its channels.
+    flat : Tensor, (K,), float64
+        The functional of the spectrum that measured shapes are divided by.
     channels : int
         M; measured shapes have a mean power of about one over the channels.
     prior : Prior
     """
 
-    def __init__(self, seen: Tensor, amplitude: Tensor, channels: int, prior: Prior):
+    def __init__(self, response: Tensor, flat: Tensor, channels: int, prior: Prior):
+        seen, amplitude = response @ prior.basis, flat @ prior.basis
         moment = prior.moment * (channels / (seen @ prior.moment @ seen.T).trace())
         self.power, self.vectors, self.gain = _eigen(seen, moment)
         # A camera may be blind to much of a cluster: its shapes are those of amplitude one.

@@ -68,7 +68,9 @@ class Reconstructor(nn.Module):
         self.provenance: dict[str, Any] = {}
 
     @classmethod
-    def for_weights(cls, calibration: Calibration, weights: Mapping[str, Tensor]) -> "Reconstructor":
+    def for_weights(
+        cls, calibration: Calibration, weights: Mapping[str, Tensor]
+    ) -> "Reconstructor":
         """Return a model that these weights fit."""
         return cls(calibration)
 

@@ -1,6 +1,5 @@
 """Random cameras to train on: filter arrays of every kind on sensors of any colour."""
 
-
 import numpy as np
 import torch
 from torch import Generator, Tensor
@@ -69,5 +68,3 @@ def _sensor(wavelength: np.ndarray, generator: Generator) -> Tensor:
         edge = (place if cut[2] < 0.7 else 1 - place) - end
         curve = curve / (1 + np.exp(np.clip(edge / 0.02, -50, 50)))
     return torch.from_numpy(curve).float()
-
-

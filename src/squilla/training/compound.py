@@ -4,7 +4,7 @@ import copy
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from squilla.errors import InputError
 from squilla.files.disk import replacing
 from squilla.reconstruction.compound import (
     LEVELS,
+    ZONES,
     BackEnd,
     Camera,
     Compound,
@@ -27,7 +28,9 @@ from squilla.reconstruction.compound import (
     noise_factor,
 )
 from squilla.reconstruction.prior import Prior, fit_prior
+from squilla.spectra import grid
 from squilla.training.cameras import random_response
+from squilla.training.fit import shown
 from squilla.training.scenes import Palette, Scenes, draw_scenes
 
 SIZE = 64
@@ -41,6 +44,9 @@ SINGLE = 64
 
 NOISE = (10.0, 45.0)
 """Signal-to-noise ratios of scenes, dB."""
+
+CHECKPOINT_EVERY = 50
+"""Steps between two checkpoints."""
 
 AVERAGED = 0.998
 """What the averaged weights keep of themselves in every step."""
@@ -130,7 +136,8 @@ class Studio:
             shaken = torch.rand(len(part), 1, 1, generator=generator, device=self.device) < 0.3
             y = misaligned(some.measured(response), 0.25 * shaken, generator)
             y, ratio = self._noisy(y, generator)
-            stated = ratio * 10 ** (0.2 * torch.randn(len(y), 1, 1, generator=generator, device=y.device))
+            wrong = torch.randn(len(y), 1, 1, generator=generator, device=y.device)
+            stated = ratio * 10 ** (0.2 * wrong)
             stated = stated * noise_factor(y, stated, camera)
             pictures.append(gather_evidence(y, stated, camera, LEVELS))
             few = slice(0, SIZE * SIZE // SINGLE * SINGLE, SIZE * SIZE // SINGLE)
@@ -179,7 +186,7 @@ def misaligned(y: Tensor, deviation: float | Tensor, generator: Generator) -> Te
 def _joined(parts: Sequence[Evidence]) -> Evidence:
     """Put the evidence of several cameras into one batch."""
 
-    def join(values: list[Any]):
+    def join(values: list[Any]) -> Any:
         if isinstance(values[0], list):
             return [torch.cat(level) for level in zip(*values, strict=True)]
         return torch.cat(values)
@@ -235,6 +242,9 @@ class _Run:
         self.optimiser = torch.optim.AdamW(
             self.model.back.parameters(), lr=recipe.learning_rate, weight_decay=1e-3
         )
+        self.held_out = Studio(
+            prior, responses[: recipe.cameras], seed=recipe.seed, held_out=True, device=device
+        ).take(0, 8, recipe.cameras)
         self.step, self.history = 0, []
 
     def train(self) -> dict[str, float]:
@@ -275,6 +285,14 @@ class _Run:
             "cover": float(cover.mean()),
         }
 
+    @torch.no_grad()
+    def validate(self) -> float:
+        """Return the geometric mean error of 8 scenes of spectra that training never sees."""
+        scenes, seen, _ = self.held_out
+        pixels = torch.arange(0, SIZE * SIZE, 8, device=self.device).expand(len(scenes.fade), -1)
+        error, _, _ = losses(self.averaged, self.model.basis, self.model.hats, scenes, seen, pixels)
+        return float(error.log().mean().exp())
+
     def write(self, path: Path) -> None:
         """Write everything from which `resume` goes on."""
         state = {
@@ -305,68 +323,93 @@ class _Run:
         model = self.model.cpu().eval()
         model.back.load_state_dict({k: v.cpu() for k, v in self.averaged.state_dict().items()})
         model.provenance = {**vars(self.recipe), "trained_steps": self.step}
+        if self.history:
+            model.provenance["validation"] = self.history[-1]["validation"]
         return model
 
 
+def from_checkpoint(path: Path, prior: Prior) -> Compound:
+    """Return the model that a training has come to, with the averaged weights."""
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    flat = Calibration.from_sensitivity(np.ones((1, len(prior.wavelength))), prior.wavelength)
+    model = Compound(flat, prior).eval()
+    model.back.load_state_dict(state["averaged"])
+    last = state["history"][-1]
+    model.provenance = {**state["recipe"], "trained_steps": state["step"]}
+    model.provenance |= {"validation": last["validation"]} if "validation" in last else {}
+    return model
+
+
 def train_compound(
-    wavelength: np.ndarray,
+    calibration: Calibration | None = None,
     recipe: Recipe | None = None,
     *,
     prior: Prior | None = None,
-    responses: Sequence[Tensor] | None = None,
     device: torch.device | str = "cpu",
-    log: Path | None = None,
-    checkpoint: Path | None = None,
+    log: str | Path | None = None,
+    checkpoint: str | Path | None = None,
     seconds: float = math.inf,
-    report: Callable[[dict[str, Any]], None] | None = None,
+    progress: bool = True,
 ) -> Compound:
     """Train the compound model.
 
     Parameters
     ----------
-    wavelength : array, (K,)
-        nm.
+    calibration : Calibration, optional
+        Camera to train for, at its field angles and with gains that vary by 2 %; default: random
+        arrays of filters on 500-750 nm.
     recipe : Recipe, optional
     prior : Prior, optional
-        Default: learnt first.
-    responses : (M, K) each, optional
-        Cameras to train for; default: random ones.
+        Default: learnt first, on the wavelengths.
     device : "cpu", "cuda", ...
     log : path, optional
-        One line of JSON for every 50 steps.
+        One line of JSON for every `CHECKPOINT_EVERY` steps.
     checkpoint : path, optional
-        Written every 50 steps; if it exists, training goes on from there.
+        Written every `CHECKPOINT_EVERY` steps; if it exists, training goes on from there.
     seconds : float
         Stop after this time, with a checkpoint to go on from.
-    report : function, optional
-        Is called with every entry of the log.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    Compound
+        On the CPU, in evaluation mode, with the weights averaged over the last steps.
     """
     recipe = Recipe() if recipe is None else recipe
-    prior = learn_prior(wavelength) if prior is None else prior
-    if responses is None:
-        generator = Generator().manual_seed(recipe.seed)
+    generator = Generator().manual_seed(recipe.seed)
+    if calibration is None:
+        wavelength = grid()
         responses = [random_response(wavelength, generator) for _ in range(recipe.arrays)]
+    else:
+        wavelength = calibration.wavelength
+        gains = 1 + 0.02 * torch.randn(ZONES, calibration.filters, 1, generator=generator)
+        least, most = (float(end) ** 2 for end in calibration.angle[[0, -1]])
+        angles = torch.linspace(least, most, ZONES).sqrt()
+        zones = torch.einsum(
+            "za,amk->zmk", calibration.angle_weights(angles), calibration.sensitivities
+        )
+        responses = list(zones * gains)
+    prior = learn_prior(wavelength) if prior is None else prior
     run = _Run(prior, responses, recipe, device)
-    if checkpoint is not None and checkpoint.exists():
-        run.resume(checkpoint)
+    if checkpoint is not None and Path(checkpoint).exists():
+        run.resume(Path(checkpoint))
     began, entries = time.perf_counter(), []
-    while run.step < recipe.steps and time.perf_counter() - began < seconds:
+    for _ in shown(range(run.step, recipe.steps), "compound", run.history, progress):
+        if time.perf_counter() - began > seconds:
+            break
         entries.append(run.train())
-        if run.step % 50 and run.step < recipe.steps:
+        if run.step % CHECKPOINT_EVERY and run.step < recipe.steps:
             continue
         entry = {key: float(np.mean([one[key] for one in entries])) for key in entries[0]}
-        entry = {"step": run.step, **entry, "seconds": round(time.perf_counter() - began, 1)}
         if not math.isfinite(entry["loss"]):
             raise InputError(f"The training diverged before step {run.step}.")
-        run.history.append(entry)
+        entry |= {"step": run.step, "validation": run.validate()}
+        run.history.append(entry | {"seconds": round(time.perf_counter() - began, 1)})
         entries = []
         if log is not None:
             with replacing(log) as temporary:
                 temporary.write_text("".join(json.dumps(one) + "\n" for one in run.history))
         if checkpoint is not None:
-            run.write(checkpoint)
-        if report is not None:
-            report(entry)
+            run.write(Path(checkpoint))
     return run.finished()
-
-

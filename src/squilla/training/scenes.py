@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 from torch.nn import functional
 
 from squilla.reconstruction.linear import within_tables
-from squilla.spectra import CHART_LIGHT, gaussian_mixtures, line_spectra, lights, reflectances
+from squilla.spectra import CHART_LIGHT, gaussian_mixtures, lights, line_spectra, reflectances
 
 HELD_OUT = 8
 """Of so many reflectances and lamps one is kept for validation, never trained on."""
@@ -182,9 +182,7 @@ def _leaves(count: int, size: int, generator: Generator, device) -> Tensor:
     axis = torch.arange(size, device=device, dtype=torch.float32)
     label = torch.zeros(count, size, size, dtype=torch.long, device=device)
     for leaf in range(1, LEAVES):
-        y, x = (
-            axis - middle[dimension, :, leaf, None] for dimension in range(2)
-        )
+        y, x = (axis - middle[dimension, :, leaf, None] for dimension in range(2))
         y, x = y[:, :, None], x[:, None, :]
         cosine, sine = turn[:, leaf].cos()[:, None, None], turn[:, leaf].sin()[:, None, None]
         long = (radius[:, leaf] * stretch[:, leaf])[:, None, None]
