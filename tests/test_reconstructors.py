@@ -199,7 +199,7 @@ def test_a_cube_carries_wavelengths_and_origin(model, y, angle):
     assert cube.attrs["calibration"] == fingerprint(CAMERA)
     assert cube.attrs["measurement_distance"] == 300
     with torch.no_grad():
-        expected = model(y, angle, 25.0).reshape(4, 6, 48)
+        expected = model(y.reshape(4, 6, 12), angle.reshape(4, 6), 25.0)
     torch.testing.assert_close(torch.from_numpy(cube.values), expected)
 
 

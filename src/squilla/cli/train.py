@@ -13,7 +13,7 @@ from squilla.errors import InputError
 def train(
     calibration: Annotated[Path, typer.Option(help="Calibration of the camera, .nc.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Model file to write.")],
-    model: Annotated[str, typer.Option(help="Network: mlp, cnn, rescnn, unet, respecnn.")] = "mlp",
+    model: Annotated[str, typer.Option(help="Network, or compound; see `squilla models`.")] = "mlp",
     noise: Annotated[str, typer.Option(help="none, 20 or 15:20 (dB, drawn evenly).")] = "15:20",
     spectra: Annotated[str, typer.Option(help="Prior: broad, gaussian, natural, line.")] = "broad",
     count: Annotated[int, typer.Option(help="Spectra in an epoch.")] = 8000,

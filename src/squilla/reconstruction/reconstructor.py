@@ -33,6 +33,7 @@ MODELS: Mapping[str, tuple[str, str, str]] = {
     "rescnn": ("networks", "ResCNN", "convolutional correction of a linear estimate; 3.6 M"),
     "unet": ("networks", "UNet", "residual U-Net along the wavelengths; 18.5 M weights"),
     "respecnn": ("networks", "ReSpecNN", "the thesis' proposal; 4.1 M weights"),
+    "compound": ("compound", "Compound", "spatial and spectral, for every camera; with intervals"),
 }
 """Every reconstructor by name: its file in this room, its class, and one line about it."""
 
@@ -55,6 +56,8 @@ class Reconstructor(nn.Module):
     name: ClassVar[str]
     trained: ClassVar[bool] = False
     """Whether its weights come from training; then its output has a shape but no scale yet."""
+    universal: ClassVar[bool] = False
+    """Whether its weights serve every camera, not only the one that they were trained for."""
     piece: ClassVar[int] = 2048
     """Pixels worked on at once."""
 
@@ -63,6 +66,13 @@ class Reconstructor(nn.Module):
         self.calibration = calibration
         self.wavelength = calibration.wavelength
         self.provenance: dict[str, Any] = {}
+
+    @classmethod
+    def for_weights(
+        cls, calibration: Calibration, weights: Mapping[str, Tensor]
+    ) -> "Reconstructor":
+        """Return a model that these weights fit."""
+        return cls(calibration)
 
     def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None) -> Tensor:
         """Map finite measurements with a maximum of 1, (N, M), to spectra, (N, K).
@@ -106,8 +116,7 @@ class Reconstructor(nn.Module):
             If `y` has another number of channels, `angle` or `snr` another shape than the pixels,
             or `scale` another name.
         """
-        if scale not in ("consistent", "maximum"):
-            raise InputError(f"There is no scale {scale!r}; there are 'consistent' and 'maximum'.")
+        check_scale(scale)
         y, angle, snr = self._accepted(y, angle, snr)
         pixels = y.shape[:-1]
         if y.numel() == 0:
@@ -166,11 +175,7 @@ class Reconstructor(nn.Module):
         """
         from squilla.reconstruction.linear import complete
 
-        y = torch.as_tensor(measurement.y, dtype=torch.float32)
-        if y.ndim != 3:
-            raise InputError(
-                f"A measurement has the shape (rows, columns, channels), not {tuple(y.shape)}."
-            )
+        y = picture(torch.as_tensor(measurement.y, dtype=torch.float32))
         y, angle, snr = self._accepted(y, measurement.angle, measurement.snr)
         y = complete(y, measurement.valid, self.calibration, angle, snr)
         device = next(iter([*self.parameters(), *self.buffers()]), y).device
@@ -240,6 +245,21 @@ class Reconstructor(nn.Module):
         content = save({key: value.contiguous() for key, value in tensors.items()}, metadata)
         with replacing(path) as temporary:
             temporary.write_bytes(content)
+
+
+def check_scale(scale: str) -> None:
+    """Raise InputError unless there is such a rule of scale."""
+    if scale not in ("consistent", "maximum"):
+        raise InputError(f"There is no scale {scale!r}; there are 'consistent' and 'maximum'.")
+
+
+def picture(y: Tensor) -> Tensor:
+    """Return y if it has rows, columns and channels."""
+    if y.ndim != 3:
+        raise InputError(
+            f"A measurement has the shape (rows, columns, channels), not {tuple(y.shape)}."
+        )
+    return y
 
 
 def _per_pixel(value: Tensor | float | None, y: Tensor, what: str) -> Tensor | None:
@@ -361,9 +381,10 @@ def _read(path: Path, calibration: Calibration) -> Reconstructor:
         sensitivity, wavelength = tensors.pop("sensitivity"), tensors.pop("wavelength")
     except (KeyError, ValueError) as error:
         raise foreign from error
-    _check_camera(path, sensitivity, wavelength.numpy(), calibration)
-    model = model_class(name)(calibration)
+    if not model_class(name).universal:
+        _check_camera(path, sensitivity, wavelength.numpy(), calibration)
     weights = {key.removeprefix("weights."): value for key, value in tensors.items()}
+    model = model_class(name).for_weights(calibration, weights)
     expected = model.state_dict()
     if not model.trained or {k: v.shape for k, v in weights.items()} != {
         k: v.shape for k, v in expected.items()

@@ -53,7 +53,10 @@ def train(
     Parameters
     ----------
     name : str
-        A network of `models`: "mlp", "cnn", "rescnn", "unet", "respecnn".
+        A network of `models`: "mlp", "cnn", "rescnn", "unet", "respecnn"; or "compound", which
+        learns a prior on the camera's wavelengths first, paints scenes of its own and draws every
+        noise (`training.compound`); of these settings it takes the number of steps, the seed, and
+        those from `device` on.
     calibration : Calibration
         With several field angles, every sample gets one at random.
     noise : None, float or (float, float)
@@ -102,6 +105,17 @@ def train(
         raise InputError("Epochs, batch and learning rate must be positive.")
     if schedule not in ("constant", "cosine"):
         raise InputError(f"There is no schedule {schedule!r}; there are constant and cosine.")
+    if kind.universal:
+        from squilla.training.compound import Recipe, train_compound
+
+        return train_compound(
+            calibration,
+            Recipe(steps=epochs * math.ceil(count / batch), seed=seed),
+            device=_device(device),
+            log=log,
+            checkpoint=checkpoint,
+            progress=progress,
+        )
     samples = Samples(calibration, spectra, count, noise, fresh, seed)
     settings = {
         "noise": _named(noise),
@@ -119,7 +133,7 @@ def train(
     if log is not None:
         with replacing(log) as temporary:
             temporary.write_text("".join(json.dumps(entry) + "\n" for entry in run.history))
-    for epoch in _shown(range(len(run.history), epochs), name, epochs, run, progress):
+    for epoch in shown(range(len(run.history), epochs), name, run.history, progress):
         run.epoch(epoch)
         if log is not None:
             with open(log, "a") as file:
@@ -261,8 +275,10 @@ def _named(noise: Noise) -> str:
     return f"{noise:g} dB"
 
 
-def _shown(steps: range, name: str, epochs: int, run: _Run, progress: bool) -> Iterable[int]:
-    """Yield the epochs, with a progress bar that shows the loss."""
+def shown(
+    steps: range, name: str, history: list[dict[str, float]], progress: bool
+) -> Iterable[int]:
+    """Yield the steps, with a progress bar that shows the last error in the growing history."""
     if not progress:
         yield from steps
         return
@@ -282,8 +298,8 @@ def _shown(steps: range, name: str, epochs: int, run: _Run, progress: bool) -> I
         TextColumn("{task.fields[loss]}"),
     )
     with Progress(*columns) as bar:
-        task = bar.add_task(f"train {name}", total=epochs, completed=steps.start, loss="")
-        for epoch in steps:
-            yield epoch
-            loss = f"validation error {run.history[-1]['validation']:.5f}"
-            bar.update(task, completed=epoch + 1, loss=loss)
+        task = bar.add_task(f"train {name}", total=steps.stop, completed=steps.start, loss="")
+        for step in steps:
+            yield step
+            loss = f"validation error {history[-1]['validation']:.5f}" if history else ""
+            bar.update(task, completed=step + 1, loss=loss)

@@ -1,0 +1,250 @@
+"""How far every reconstructor is from the truth, in one table.
+
+    python benchmarks/accuracy.py [--weights FILE] [--quick]
+
+Every row is a scene before a simulated camera, y = R x + noise; no row has a spectrum, a scene or a
+random array that any method was trained on. The networks that know one camera stand only in that
+camera's rows: `mlp` was trained on the broad prior. Methods that treat every pixel alone are judged
+on 3000 pixels of each scene, the others on all. Writes experiments/results/accuracy.json.
+"""
+
+import argparse
+import json
+import os
+import platform
+import time
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.io import loadmat
+from torch import Generator, Tensor
+
+import squilla
+from squilla.calibration.alignment import Measurement
+from squilla.calibration.calibration import Calibration
+from squilla.camera.scenes import load_scene
+from squilla.evaluation.metrics import DARKEST, evaluate
+from squilla.optics.filters import StencilRecipe
+from squilla.reconstruction.compound import Compound
+from squilla.reconstruction.reconstructor import Reconstructor, load_model
+from squilla.spectra import grid
+from squilla.training.compound import misaligned
+from squilla.training.noise import add_noise
+from squilla.training.scenes import Palette, draw_scenes
+
+RESULTS = Path(__file__).parents[1] / "experiments" / "results" / "accuracy.json"
+WAVELENGTH = grid()
+SAMPLE = 3000
+PICTURES = ("indian-pines", "corn-kernel")
+ANGLES = np.radians([0.0, 4.64, 6.57, 8.04, 9.29])
+
+
+@dataclass
+class Case:
+    """A measurement whose truth is known."""
+
+    name: str
+    calibration: Calibration
+    truth: Tensor
+    y: Tensor
+    snr: float
+    angle: Tensor | None = None
+    dead: tuple[int, ...] = ()
+
+    def measurement(self) -> Measurement:
+        valid = torch.ones(self.y.shape, dtype=torch.bool)
+        valid[..., list(self.dead)] = False
+        flat = torch.zeros(self.y.shape[:2])
+        angle = flat if self.angle is None else self.angle
+        return Measurement(self.y, valid, angle, flat, torch.full_like(flat, self.snr))
+
+
+# --- cameras ------------------------------------------------------------------------------------
+
+
+def sensor() -> np.ndarray:
+    """Return the quantum efficiency of the simulated sensor, (K,)."""
+    knots = [500, 525, 550, 600, 650, 700, 750], [0.78, 0.79, 0.77, 0.70, 0.60, 0.48, 0.37]
+    return np.interp(WAVELENGTH, *knots)
+
+
+def random_array(seed: int, filters: int = 36, angle: np.ndarray | None = None) -> Calibration:
+    """Return a stencil array of the thesis' recipe on the simulated sensor."""
+    array = StencilRecipe(filters).draw(seed)
+    response = array.transmittance(WAVELENGTH, 0.0 if angle is None else angle).numpy() * sensor()
+    return Calibration.from_sensitivity(response, WAVELENGTH, angle)
+
+
+def trained_array() -> Calibration:
+    """Return the camera that the shipped `mlp` was trained for: the thesis' camera, calibrated."""
+    from safetensors import safe_open
+
+    path = files("squilla") / "data" / "weights" / "mlp.safetensors"
+    with safe_open(str(path), "pt") as file:
+        response, wavelength = file.get_tensor("sensitivity"), file.get_tensor("wavelength")
+    return Calibration.from_sensitivity(response.numpy(), wavelength.numpy())
+
+
+def mosaic(name: str) -> Calibration:
+    """Return a measured mosaic camera within 500-750 nm."""
+    path = files("squilla") / "data" / "responses" / f"spectral_responses_{name}.mat"
+    profiles = loadmat(str(path))["SpectralProfiles"]
+    return Calibration.from_sensitivity(profiles[:, 100:351], WAVELENGTH)
+
+
+# --- scenes -------------------------------------------------------------------------------------
+
+
+def scene(name: str) -> Tensor:
+    return torch.from_numpy(load_scene(name, WAVELENGTH).values)
+
+
+def line_chart(size: int = 250) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray]:
+    """Return 36 patches that each show one line on a dark ground, FWHM 1 to 30 nm.
+
+    Returns
+    -------
+    cube (size, size, K), label (size, size), centre (36,) nm, fwhm (36,) nm
+    """
+    random = np.random.default_rng(20_26)
+    fwhm = np.repeat([1.0, 2.0, 5.0, 10.0, 20.0, 30.0], 6)
+    centre = random.uniform(515, 735, 36)
+    spectra = np.exp(-4 * np.log(2) * ((WAVELENGTH - centre[:, None]) / fwhm[:, None]) ** 2)
+    cell = np.arange(size) * 6 // size
+    label = torch.from_numpy(cell[:, None] * 6 + cell)
+    return torch.from_numpy(spectra).float()[label], label, centre, fwhm
+
+
+def textures(seed: int, size: int = 250) -> Tensor:
+    """Return a scene of leaves painted with reflectances and lamps that nobody trained on."""
+    palette = Palette(WAVELENGTH, held_out=True, seed=99, count=2000)
+    scenes = draw_scenes(1, size, palette, Generator().manual_seed(seed))
+    return scenes.cubes(torch.arange(size * size)[None])[0].view(size, size, -1)
+
+
+def cases(quick: bool) -> list[Case]:
+    """Return every row of the table."""
+    generator = Generator().manual_seed(7)
+    home = trained_array()
+    chart = scene("chart")
+
+    def case(name: str, calibration: Calibration, truth: Tensor, snr: float, **more) -> Case:
+        y = add_noise(calibration.project(truth), snr, generator)
+        return Case(name, calibration, truth, y, snr, **more)
+
+    rows = [case(f"chart, {snr} dB", home, chart, snr) for snr in (15, 20, 30, 40)]
+    lines = line_chart()[0]
+    rows += [case(f"lines of 1-30 nm, {snr} dB", home, lines, snr) for snr in (20, 30)]
+    rows += [case(f"{name}, 30 dB", home, scene(name), 30) for name in PICTURES]
+    rows += [case(f"unseen textures {n}, 20 dB", home, textures(n), 20) for n in (1, 2, 3)]
+    rows += [
+        case(f"unseen array {n}, chart 20 dB", random_array(1000 + n), chart, 20)
+        for n in range(2 if quick else 10)
+    ]
+    rows += [case(f"mosaic {n}, chart 20 dB", mosaic(n), chart, 20) for n in ("4x4", "5x5")]
+    rows += [
+        case(f"{m} random filters, chart 20 dB", random_array(2000 + m, m), chart, 20)
+        for m in (16, 25, 64)
+    ]
+    rows += [
+        case(f"{n} dead channels, chart 20 dB", home, chart, 20, dead=tuple(range(5, 5 + 7 * n, 7)))
+        for n in (1, 2, 4)
+    ]
+    for wrong in (-5, 5):
+        row = case(f"noise stated {wrong:+d} dB, chart 20 dB", home, chart, 20)
+        rows.append(replace(row, snr=20.0 + wrong))
+    y = misaligned(home.project(chart)[None], 0.3, generator)[0]
+    y = add_noise(y, 20, generator)
+    rows.append(Case("misaligned 0.3 px, chart 20 dB", home, chart, y, 20))
+    tilted = random_array(13, angle=ANGLES)
+    for place, field in (("centre", 0.0), ("corner", ANGLES[-1] - 0.001)):
+        angle = torch.full(chart.shape[:2], field)
+        y = add_noise(tilted.project(chart, angle), 30, generator)
+        rows.append(Case(f"{place} of the field, chart 30 dB", tilted, chart, y, 30, angle))
+    return rows
+
+
+# --- judgement ----------------------------------------------------------------------------------
+
+
+def judge(case: Case, weights: Path | None) -> dict:
+    """Return the metrics of every method for one row."""
+    generator = Generator().manual_seed(1)
+    truth = case.truth.reshape(-1, len(WAVELENGTH))
+    bright = torch.nonzero(truth.amax(-1) >= DARKEST * truth.max())[:, 0]
+    some = bright[torch.randperm(len(bright), generator=generator)[:SAMPLE]]
+    result: dict = {"row": case.name}
+    names = ["ridge", "sparse"]
+    if case.calibration.filters == 36 and len(case.calibration.angle) == 1 and not case.dead:
+        names.append("mlp")
+    for name in names:
+        try:
+            model = load_model(name, case.calibration)
+        except squilla.InputError:  # the network of another camera
+            continue
+        result[name] = _metrics(pixel_wise(model, case, some), truth[some])
+    model = load_model("compound" if weights is None else weights, case.calibration)
+    assert isinstance(model, Compound)
+    began = time.perf_counter()
+    cube, width = model.reconstruct_interval(case.measurement())
+    result["seconds"] = round(time.perf_counter() - began, 2)
+    result["compound"] = _metrics(cube.values, case.truth.numpy())
+    judged = case.truth.amax(-1) >= DARKEST * case.truth.max()
+    inside = np.abs(cube.values - case.truth.numpy()) <= width.values
+    result["compound"]["cover"] = float(inside[judged.numpy()].mean())
+    return result
+
+
+def pixel_wise(model: Reconstructor, case: Case, some: Tensor) -> np.ndarray:
+    """Reconstruct some pixels by a method that treats each alone."""
+    whole = case.measurement()
+
+    def chosen(values: Tensor) -> Tensor:
+        return values.reshape(-1, *values.shape[2:])[some][None]
+
+    assert whole.snr is not None
+    part = Measurement(
+        chosen(whole.y), chosen(whole.valid), chosen(whole.angle), chosen(whole.disparity),
+        chosen(whole.snr),
+    )  # fmt: skip
+    return model.reconstruct(part).values[0]
+
+
+def _metrics(estimate: np.ndarray, truth) -> dict[str, float]:
+    found = evaluate(np.asarray(estimate), np.asarray(truth))
+    return {key: found[key] for key in ("mse", "sam_deg", "psnr_db")}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The table of accuracy.")
+    parser.add_argument("--weights", type=Path, help="compound weights; default: those that ship")
+    parser.add_argument("--quick", action="store_true", help="two unseen arrays instead of ten")
+    parser.add_argument("--only", help="rows whose name holds this text")
+    options = parser.parse_args()
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1)))
+    names = ("ridge", "sparse", "mlp", "compound")
+    print("| row | " + " | ".join(names) + " | SAM | PSNR | cover |")
+    print("|---" * 8 + "|")
+    rows = []
+    for case in cases(options.quick):
+        if options.only and options.only not in case.name:
+            continue
+        row = judge(case, options.weights)
+        rows.append(row)
+        errors = [f"{row[name]['mse']:.5f}" if name in row else "" for name in names]
+        own = row["compound"]
+        print(
+            f"| {row['row']} | {' | '.join(errors)} | {own['sam_deg']:.1f} | {own['psnr_db']:.1f} "
+            f"| {own['cover']:.3f} |",
+            flush=True,
+        )
+    if not options.only:
+        story = {"machine": platform.processor() or platform.machine(), "rows": rows}
+        RESULTS.write_text(json.dumps(story, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
