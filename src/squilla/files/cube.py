@@ -155,6 +155,12 @@ def open_cube(
     stored, extra = _open(path, variable, given)
     cube = _in_nanometres(stored, path)
     cube.encoding["together"] = stored.encoding["together"]
+    order = np.argsort(stored["wavelength"].values, kind="stable")
+    if (np.diff(order) != 1).any():
+        extra = {
+            name: each.isel(wavelength=order) if each.ndim == 3 else each
+            for name, each in extra.items()
+        }
     return cube, extra
 
 

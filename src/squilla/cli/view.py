@@ -1,0 +1,75 @@
+"""``squilla view``: look at cubes in a browser."""
+
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from squilla.live.server import Source
+
+Host = Annotated[
+    str,
+    typer.Option(help="Address to bind; one that others can reach demands a token."),
+]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="0 for any that is free.")]
+Browser = Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page.")]
+
+
+def view(
+    cube: Annotated[list[Path], typer.Argument(help=".nc .hdr .zarr .tiff .npz .npy .mat")],
+    reference: Annotated[
+        list[Path] | None, typer.Option(help="Table of wavelengths and spectra, .csv or .txt.")
+    ] = None,
+    variable: Annotated[
+        str | None, typer.Option(help="Name of the cube where a file holds several.")
+    ] = None,
+    wavelength: Annotated[
+        Path | None, typer.Option(help="List of wavelengths, nm, where a file has none.")
+    ] = None,
+    memory: Annotated[float, typer.Option(help="Cubes above so many GB are read by need.")] = 1.0,
+    host: Host = "127.0.0.1",
+    port: Port = 8750,
+    browser: Browser = True,
+) -> None:
+    """Look at cubes: colour, bands, spectra, maps.
+
+    Example: squilla view doll.nc --reference paints.csv
+    """
+    from squilla.errors import InputError
+    from squilla.live.reference import read_references
+    from squilla.live.server import Broken
+    from squilla.live.stored import StoredCube
+
+    sources: list[Source] = []
+    for path in cube:
+        try:
+            sources.append(
+                StoredCube.open(
+                    path, held=int(memory * 1e9), variable=variable, wavelength=wavelength
+                )
+            )
+        except InputError as error:
+            if len(cube) == 1:
+                raise
+            typer.echo(f"squilla: {error}", err=True)
+            sources.append(Broken(path.name, str(error)))
+    if all(isinstance(source, Broken) for source in sources):
+        raise InputError("None of these files is a cube.")
+    spectra = [one for path in reference or () for one in read_references(path)]
+    show(sources, host=host, port=port, browser=browser, references=spectra)
+
+
+def show(
+    sources: "list[Source]", *, host: str, port: int, browser: bool, references: list[dict]
+) -> None:
+    """Serve sources until interrupted, and say where."""
+    from squilla.live.server import is_loopback, serve
+
+    def ready(address: str) -> None:
+        typer.echo(f"{address}\nCtrl+C ends it.")
+        if browser and is_loopback(host):
+            webbrowser.open(address)
+
+    serve(sources, host=host, port=port, references=references, ready=ready)
