@@ -37,6 +37,8 @@ def view(
 
     Example: squilla view doll.nc --reference paints.csv
     """
+    from threading import Thread
+
     from squilla.errors import InputError
     from squilla.live.reference import read_references
     from squilla.live.server import Broken
@@ -57,6 +59,8 @@ def view(
             sources.append(Broken(path.name, str(error)))
     if all(isinstance(source, Broken) for source in sources):
         raise InputError("None of these files is a cube.")
+    first = next(source for source in sources if isinstance(source, StoredCube))
+    Thread(target=first.warm, daemon=True).start()  # while the page opens
     spectra = [one for path in reference or () for one in read_references(path)]
     show(sources, host=host, port=port, browser=browser, references=spectra)
 

@@ -67,6 +67,11 @@ class StoredCube:
         cube, extra = open_cube(path, **how)
         return cls(cube, extra, title=path.name, held=held)
 
+    def warm(self) -> None:
+        """Read the cube before it is asked for, where it is held in memory."""
+        if self._held:
+            self._whole()
+
     def now(self) -> "StoredCube":
         """Return what stands still while it is asked: the cube itself."""
         return self
@@ -84,6 +89,7 @@ class StoredCube:
             "rows": self.shape[0],
             "columns": self.shape[1],
             "wavelength": self.wavelength.tolist(),
+            "colours": spectral_colours(self.wavelength),
             "quantity": told.get("long_name", str(self._cube.name or "value")),
             "unit": told.get("units", ""),
             "by_need": not self._held,
@@ -237,6 +243,15 @@ class StoredCube:
         if name not in self.extra or self.extra[name].ndim != 3:
             raise InputError(f"{self.title} has no layer {name!r} with bands.")
         return self.extra[name]
+
+
+def spectral_colours(wavelength: np.ndarray) -> list[str]:
+    """Return the colour of the light of each band as ``#rrggbb``, dark where nobody sees it."""
+    linear = np.clip(rgb_weights(wavelength), 0, None)
+    linear = linear / max(float(linear.max()), 1e-12)
+    return [
+        "#" + "".join(f"{round(255 * part ** (1 / 2.4)):02x}" for part in each) for each in linear
+    ]
 
 
 def _moments(blocks: Iterator[np.ndarray]) -> tuple[np.ndarray, np.ndarray, int]:
