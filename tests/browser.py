@@ -13,11 +13,11 @@ from types import TracebackType
 from websockets.sync.client import connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome", "microsoft-edge")
-FLAGS = (
-    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
-    "--disable-background-networking --disable-component-update --disable-sync "
-    "--disable-extensions --hide-scrollbars --force-color-profile=srgb"
-).split()
+FLAGS = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--disable-extensions", "--hide-scrollbars", "--force-color-profile=srgb",
+]  # fmt: skip
 MISSING = (
     "needs a browser: install Chromium (on Debian: apt-get install chromium), or name one with "
     "the variable CHROMIUM"
@@ -34,7 +34,12 @@ class Browser:
 
     def __enter__(self) -> "Browser":
         self.home = tempfile.mkdtemp(prefix="squilla-browser-")
-        command = [find() or "", *FLAGS, "--remote-debugging-port=0", f"--user-data-dir={self.home}"]
+        command = [
+            find() or "",
+            *FLAGS,
+            "--remote-debugging-port=0",
+            f"--user-data-dir={self.home}",
+        ]
         self.process = subprocess.Popen(
             [*command, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
@@ -154,7 +159,7 @@ class Page:
         self.drag([(left + width / 2, top + height / 2)])
 
     def drag(self, path: list[tuple[float, float]]) -> None:
-        """Press the mouse at the first place, move it along a path, let go; one place is a click."""
+        """Press the mouse at the first place, move it along a path, let go: one place, a click."""
         mouse = {"button": "left", "buttons": 1, "clickCount": 1}
         for kind, (x, y) in [
             ("mouseMoved", path[0]), ("mousePressed", path[0]),

@@ -276,11 +276,12 @@ async function fetchSpectrum(item) {
     return;
   }
   item.fetching = true;
+  busy();
   try {
     const { header, values } = await connection.ask({ ask: "spectra", source: number, regions: [region] });
     const bands = spectra.wavelength.length;
     Object.assign(item, {
-      mean: values.slice(0, bands), spread: values.slice(bands, 2 * bands), pixels: header.pixels[0],
+      measured: region, mean: values.slice(0, bands), spread: values.slice(bands, 2 * bands), pixels: header.pixels[0],
     });
     await uncertainty(item, region);
     arrived(item);
@@ -293,6 +294,11 @@ async function fetchSpectrum(item) {
     item.again = false;
     fetchSpectrum(item);
   }
+  busy();
+}
+
+function busy() {
+  $("spectra").setAttribute("aria-busy", spectra.placed.some(({ fetching }) => fetching));
 }
 
 /** Fetch the standard deviation that the file states for a point, if it does. */

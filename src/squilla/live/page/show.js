@@ -40,7 +40,7 @@ export class Show {
   /** Show another cube. */
   open(number, about) {
     const near = (nm) => nearest(about.wavelength, nm);
-    const same = this.about?.wavelength.join() === about.wavelength.join();
+    const same = this.about?.wavelength?.join() === about.wavelength.join();
     Object.assign(this, { number, about, planes: null, live: null });
     if (!same) {
       this.band = near(about.wavelength.length ? 600 : 0);

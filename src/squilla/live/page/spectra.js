@@ -77,10 +77,10 @@ export class Spectra {
   }
 
   pin() {
-    if (!this.selection?.mean || this.pins.length >= MOST) return false;
+    if (!this.selection || this.pins.length >= MOST) return false;
     const taken = new Set(this.pins.map(({ number }) => number));
     const number = Array.from({ length: MOST }, (_, at) => at + 1).find((each) => !taken.has(each));
-    this.pins.push({ ...this.selection, number, colour: `--pin-${number - 1}` });
+    this.pins.push(Object.assign(this.selection, { number, colour: `--pin-${number - 1}` }));
     this.active = this.pins.at(-1);
     this.selection = null;
     return true;
@@ -141,7 +141,7 @@ export class Spectra {
     const columns = [["wavelength nm", this.wavelength]];
     for (const item of this.placed) {
       if (!item.mean) continue;
-      const [top, left, bottom, right] = item.region;
+      const [top, left, bottom, right] = item.measured;
       const place = item.pixels > 1 ? `x ${left}-${right - 1} y ${top}-${bottom - 1}` : `x ${left} y ${top}`;
       const name = item.number ? `pin ${item.number} (${place})` : `selection (${place})`;
       columns.push([name, item.mean]);
