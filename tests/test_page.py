@@ -252,6 +252,36 @@ def test_pictures_are_exported_pixel_for_pixel(page, cube, tmp_path):
     assert grey.max() == 255
 
 
+def test_looking_closely_at_a_large_cube(browser, tmp_path):
+    """Of a long picture every third pixel is shown; zoomed in, every one, read from the disk."""
+    random = np.random.default_rng(1)
+    values = random.random((60, 2500, 3), dtype=np.float32)
+    values[:] = values[:1]  # one value a column, easy to find again
+    save(labelled(values, np.array([500.0, 550, 600])), tmp_path / "long.hdr")
+    with running(StoredCube.open(tmp_path / "long.hdr", held=0)) as place:
+        page = browser.page()
+        page.open(f"http://{place}/")
+        page.wait(FIRST)
+        page.key("b")
+        wheel = {"type": "mouseWheel", "x": 400, "y": 360, "deltaX": 0, "deltaY": -60}
+        for _ in range(40):
+            page.send("Input.dispatchMouseEvent", **wheel)
+
+        def under(x: int) -> tuple[int, float]:
+            page.send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=360)
+            text = page.wait("document.querySelector('#readout').value")
+            _, column, _, _, value = str(text).split()
+            return int(column), float(value)
+
+        for x in range(80, 760, 70):
+            end = time.monotonic() + 5
+            while not values[0, (found := under(x))[0], 2] == pytest.approx(found[1], rel=1e-3):
+                assert time.monotonic() < end, found
+        assert under(80)[0] + 9 < under(710)[0] + 1
+        assert page.complaints() == []
+        page.close()
+
+
 def test_another_cube_and_one_that_is_none(page, cube):
     click(page, 12, 30)
     page.click("#tab-1")

@@ -28,7 +28,7 @@ export class Contrast {
   /** Fit the contrast to every picture again, or keep the present one for all. */
   fit() {
     this.show.auto = !this.show.auto;
-    if (this.show.auto && this.show.planes) {
+    if (this.show.auto && this.show.whole) {
       this.show.fitContrast();
       this.show.repaint();
     }
@@ -45,7 +45,7 @@ export class Contrast {
   draw() {
     const { show, canvas } = this;
     $("auto").setAttribute("aria-pressed", show.auto);
-    if (!show.planes || !canvas.clientWidth) return;
+    if (!show.whole || !canvas.clientWidth) return;
     const [from, to] = this.domain, { low, high, sorted } = show;
     const ratio = devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
     canvas.width = Math.round(width * ratio);

@@ -23,12 +23,15 @@ function note(name, start) {
 // --- parts -------------------------------------------------------------------------------------
 
 const spectra = new Spectra();
-let sources = [], number = 0, playing = null;
+let sources = [], number = 0, playing = null, show = null;
 
 const view = new View($("picture"), {
   select: (region, done) => select(region, done),
   hover: (point) => readout(point),
-  zoomed: () => { $("zoom").value = `${Math.round(view.scale * 100)} %`; },
+  zoomed: () => {
+    $("zoom").value = `${Math.round(view.scale * 100)} %`;
+    show?.sharpen();
+  },
 });
 
 const plot = new Plot($("plot"), {
@@ -42,7 +45,7 @@ const connection = new Connection({
   lost: () => warn("The viewer does not answer; trying again. If it was ended, start it in the terminal."),
 });
 
-const show = new Show(connection, view, {
+show = new Show(connection, view, {
   shown: () => shown(),
   failed: (error) => warn(error.message, true),
   waiting: (flag) => { $("waiting").hidden = !flag; },
@@ -77,7 +80,7 @@ function open(at) {
   live.open(about);
   if (about.error) {
     stop();
-    Object.assign(show, { about, planes: null });
+    Object.assign(show, { about, whole: null, fine: null });
     cover("This is no cube", about.error);
     return;
   }
@@ -437,7 +440,7 @@ function setTheme(name) {
 
 const stem = () => sources[number].title.replace(/\.[^.]+$/, "");
 const exportSpectra = () => save(`${stem()}-spectra.csv`, new Blob([spectra.csv()], { type: "text/csv" }));
-const exportPicture = () => savePicture(`${stem()}-${show.mode}.png`, view.image);
+const exportPicture = () => savePicture(`${stem()}-${show.mode}.png`, view.image.canvas);
 const exportPlot = () => savePlot(`${stem()}-spectra.png`, plot);
 
 function menu(on) {

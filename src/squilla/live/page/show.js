@@ -34,14 +34,14 @@ export class Show {
     this.gamma = 2.2;
     this.white = null;
     this.target = null;
-    this.live = null;
+    this.whole = this.fine = null;
   }
 
   /** Show another cube. */
   open(number, about) {
     const near = (nm) => nearest(about.wavelength, nm);
     const same = this.about?.wavelength?.join() === about.wavelength.join();
-    Object.assign(this, { number, about, planes: null, live: null });
+    Object.assign(this, { number, about, whole: null, fine: null });
     if (!same) {
       this.band = near(about.wavelength.length ? 600 : 0);
       this.three = [650, 550, 500].map(near);
@@ -160,16 +160,43 @@ export class Show {
     }
   }
 
-  /** Combine and paint pictures in the order of `wanted`. */
+  /** Combine pictures, in the order of `wanted`, to what is shown. */
+  combine(pictures) {
+    const [{ planes, width, height, stride, window }] = pictures;
+    const shape = { width, height, stride, window };
+    if (this.mode === "three") return { ...shape, planes: pictures.map((each) => each.planes[0]) };
+    if (this.mode === "ratio") return { ...shape, planes: [divide(planes[0], pictures[1].planes[0])] };
+    return { ...shape, planes };
+  }
+
   paint(pictures) {
-    let [{ planes, width, height, stride }] = pictures;
-    if (this.mode === "three") planes = pictures.map((each) => each.planes[0]);
-    if (this.mode === "ratio") planes = [divide(planes[0], pictures[1].planes[0])];
-    Object.assign(this, { planes, width, height, stride });
-    const owner = this.mode === "three" || this.mode === "ratio" ? {} : pictures[0];
+    const whole = this.combine(pictures), { planes } = whole;
+    const owner = pictures.length > 1 ? {} : pictures[0];
     this.sorted = owner.sorted ??= sample(this.mode === "colour" ? [luminance(planes)] : planes);
+    Object.assign(this, { whole, fine: null });
     if (this.auto) this.fitContrast();
     this.repaint();
+    this.sharpen();
+  }
+
+  /** Where the whole picture leaves pixels out and one looks closely, fetch the part in view. */
+  sharpen() {
+    clearTimeout(this.soon);
+    if (!this.whole || this.whole.stride === 1 || this.about.live) return;
+    this.soon = setTimeout(async () => {
+      const window = this.view.visible(), wanted = this.wanted(), whole = this.whole;
+      const [top, left, bottom, right] = window;
+      const longest = Math.max(bottom - top, right - left);
+      if (longest * 1.5 > Math.max(this.about.rows, this.about.columns)) return;
+      try {
+        const answers = await Promise.all(wanted.map((ask) => this.connection.ask({ ...this.message(ask), window })));
+        if (this.whole !== whole) return;
+        this.fine = this.combine(answers.map((answer, at) => unfold(answer, wanted[at].kind)));
+        this.repaint();
+      } catch (error) {
+        this.told.failed(error);
+      }
+    }, 150);
   }
 
   fitContrast() {
@@ -182,12 +209,14 @@ export class Show {
   }
 
   repaint() {
-    if (!this.planes) return;
-    const { planes, low, high } = this;
-    this.view.show(this.width, this.height, (pixels) => {
-      if (this.isColour) paintColour(planes, pixels, low, high, this.mode === "colour" ? "srgb" : this.gamma);
+    if (!this.whole) return;
+    const { low, high } = this, gamma = this.mode === "colour" ? "srgb" : this.gamma;
+    const painter = ({ planes }) => (pixels) => {
+      if (this.isColour) paintColour(planes, pixels, low, high, gamma);
       else paintPlane(planes[0], pixels, low, high, this.colours);
-    });
+    };
+    this.view.show(this.whole, painter(this.whole));
+    this.view.showPart(this.fine, this.fine && painter(this.fine));
     this.told.shown(this);
   }
 
@@ -198,10 +227,12 @@ export class Show {
 
   /** Return the numbers under a pixel of the cube. */
   values([row, column]) {
-    if (!this.planes) return [];
-    const at = Math.min(Math.floor(row / this.stride), this.height - 1) * this.width
-      + Math.min(Math.floor(column / this.stride), this.width - 1);
-    return this.planes.map((plane) => plane[at]);
+    const inside = ({ window: [top, left, bottom, right] }) => row >= top && row < bottom && column >= left && column < right;
+    const shown = [this.fine, this.whole].find((each) => each && inside(each));
+    if (!shown) return [];
+    const { planes, stride, width, window: [top, left] } = shown;
+    const at = Math.floor((row - top) / stride) * width + Math.floor((column - left) / stride);
+    return planes.map((plane) => plane[at]);
   }
 }
 
@@ -221,7 +252,7 @@ export function unfold({ header, values }, kind) {
   const [count, height, width] = header.shape, size = height * width;
   if (kind === "angle") for (let at = 0; at < size; at++) values[at] *= DEGREES;
   const planes = Array.from({ length: count }, (_, at) => values.subarray(at * size, (at + 1) * size));
-  return { planes, width, height, stride: header.stride, bytes: values.byteLength };
+  return { planes, width, height, stride: header.stride, window: header.window, bytes: values.byteLength };
 }
 
 function divide(one, other) {

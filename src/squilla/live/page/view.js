@@ -2,6 +2,24 @@
 
 const NEAR = 4; // screen pixels below which a press is a click, not a drag
 
+/** Pixels to paint on, and the canvas that shows them. */
+class Image {
+  constructor() {
+    this.canvas = document.createElement("canvas");
+    this.pen = this.canvas.getContext("2d");
+  }
+
+  fill({ width, height }, paint) {
+    if (this.canvas.width !== width || this.canvas.height !== height || !this.pixels) {
+      Object.assign(this.canvas, { width, height });
+      this.pixels = this.pen.createImageData(width, height);
+      this.words = new Uint32Array(this.pixels.data.buffer);
+    }
+    paint(this.words);
+    this.pen.putImageData(this.pixels, 0, 0);
+  }
+}
+
 export class View {
   /**
    * @param {HTMLCanvasElement} canvas
@@ -11,8 +29,9 @@ export class View {
     this.canvas = canvas;
     this.told = told;
     this.context = canvas.getContext("2d");
-    this.image = document.createElement("canvas");
-    this.detail = null;
+    this.image = new Image();
+    this.part = new Image();
+    this.window = null;
     this.rows = this.columns = 0;
     this.scale = 1;
     this.left = this.top = 0;
@@ -28,21 +47,27 @@ export class View {
   /** Take the size of a cube, px; keeps zoom and place if it is the same as before. */
   measure(rows, columns) {
     if (rows === this.rows && columns === this.columns) return;
-    Object.assign(this, { rows, columns, cursor: null, detail: null });
+    Object.assign(this, { rows, columns, cursor: null, window: null });
     this.fit();
   }
 
-  /** Let `paint(pixels)` fill a picture of w x h pixels, and show it. */
-  show(width, height, paint) {
-    if (this.image.width !== width || this.image.height !== height || !this.pixels) {
-      Object.assign(this.image, { width, height });
-      this.pen = this.image.getContext("2d");
-      this.pixels = this.pen.createImageData(width, height);
-      this.words = new Uint32Array(this.pixels.data.buffer);
-    }
-    paint(this.words);
-    this.pen.putImageData(this.pixels, 0, 0);
+  /** Let `paint(pixels)` fill the whole picture, and show it. */
+  show(size, paint) {
+    this.image.fill(size, paint);
     this.draw();
+  }
+
+  /** Let `paint(pixels)` fill a part that is shown more finely over the whole; null takes it away. */
+  showPart(size, paint) {
+    if (size) this.part.fill(size, paint);
+    this.window = size?.window ?? null;
+    if (size) this.draw();
+  }
+
+  /** Return the part of the picture that is on the stage: top, left, bottom, right. */
+  visible() {
+    const [top, left] = this.clamped(0, 0), [bottom, right] = this.clamped(this.width, this.height);
+    return [top, left, bottom + 1, right + 1];
   }
 
   resize() {
@@ -115,10 +140,16 @@ export class View {
     pen.clearRect(0, 0, this.width, this.height);
     pen.imageSmoothingEnabled = this.scale < 1;
     pen.imageSmoothingQuality = "high";
-    pen.drawImage(this.image, this.left, this.top, this.columns * this.scale, this.rows * this.scale);
+    this.put(this.image, [0, 0, this.rows, this.columns]);
+    if (this.window) this.put(this.part, this.window);
     for (const mark of this.marks) this.mark(mark);
     if (this.cursor && document.activeElement === this.canvas) this.cross(this.cursor);
     if (this.box) this.mark({ region: this.box, colour: "#fff" });
+  }
+
+  put({ canvas }, [top, left, bottom, right]) {
+    const { scale } = this;
+    this.context.drawImage(canvas, this.left + left * scale, this.top + top * scale, (right - left) * scale, (bottom - top) * scale);
   }
 
   /** Draw a point as a ring, a region as a frame, dark about light so that both show anywhere. */
