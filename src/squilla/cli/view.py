@@ -77,3 +77,47 @@ def show(
             webbrowser.open(address)
 
     serve(sources, host=host, port=port, references=references, ready=ready)
+
+
+def live(
+    calibration: Annotated[Path, typer.Option(help="Of the camera, .nc.")],
+    source: Annotated[str, typer.Option(help="twin, or a folder of raw frames.")] = "twin",
+    model: Annotated[str, typer.Option(help="A name of `squilla models`, or a file.")] = "ridge",
+    camera: Annotated[
+        str, typer.Option(help="The twin's design: thesis, or a TOML file.")
+    ] = "thesis",
+    scene: Annotated[str, typer.Option(help="What the twin sees: a scene or a file.")] = "chart",
+    distance: Annotated[
+        float | None, typer.Option(help="Of the scene, mm; default: found from each frame.")
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where the page records: a folder for raw TIFF, or a new .zarr of cubes."
+        ),
+    ] = None,
+    host: Host = "127.0.0.1",
+    port: Port = 8750,
+    browser: Browser = True,
+) -> None:
+    """Look through a camera: the newest frame, aligned and reconstructed, in a browser.
+
+    Example: squilla live --source twin --calibration camera.nc --model ridge
+    """
+    from squilla.calibration.store import load_calibration
+    from squilla.live.pipeline import LiveSource
+    from squilla.live.record import Recorder
+    from squilla.live.source import open_source
+    from squilla.reconstruction.reconstructor import load_model
+
+    learnt = load_calibration(calibration)
+    reconstructor = load_model(model, learnt)
+    recorder = None if record is None else Recorder(record)
+    frames = open_source(source, camera, scene)
+    shown = LiveSource(
+        frames, learnt, reconstructor, title=source, recorder=recorder, distance=distance
+    )
+    try:
+        show([shown], host=host, port=port, browser=browser, references=[])
+    finally:
+        shown.close()

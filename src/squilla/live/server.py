@@ -256,25 +256,23 @@ class Client:
 
     async def _follow(self, watch: Watch) -> None:
         """Send the answers for the newest frame, wait until they are shown, go on."""
-        seen = -1
         try:
             source = self._source(watch.source)
             if not source.describe()["live"]:
                 raise InputError(f"{source.describe()['title']} never changes.")
+            view = await self._work(source.now)  # may wait for the first frame
         except InputError as error:
             await self._send({"id": watch.id, "error": str(error)})
             return
         while True:
-            view = source.now()
-            if view.number <= seen:
-                await asyncio.sleep(_POLL)
-                continue
-            seen = self._frame = view.number
+            self._frame, seen = view.number, view.number
             self._shown.clear()
             for ask in watch.wanted:
                 await self._send_packed(await self._work(_asked, view, ask, {"frame": seen}))
             await self._send({"frame": seen, "status": view.status(), "last": True})
             await self._shown.wait()
+            while (view := source.now()).number <= seen:
+                await asyncio.sleep(_POLL)
 
     async def _stop_watching(self) -> None:
         if self._watch is not None:

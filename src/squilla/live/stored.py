@@ -53,7 +53,7 @@ class StoredCube:
         self.extra = extra or {}
         self.wavelength = np.asarray(cube["wavelength"], float)
         self.shape = cube.shape
-        self._cube = cube
+        self.cube = cube
         self._held = 4 * cube.size <= held
         self._values: np.ndarray | None = None
         self._kept: OrderedDict[tuple, np.ndarray] = OrderedDict()
@@ -82,7 +82,7 @@ class StoredCube:
 
     def describe(self) -> dict[str, Any]:
         """Return what a page must know before it asks: size, wavelengths, layers, origin."""
-        attributes = self._cube.attrs
+        attributes = self.cube.attrs
         told = {str(k): str(v)[:200] for k, v in attributes.items() if str(v)}
         return {
             "title": self.title,
@@ -90,7 +90,7 @@ class StoredCube:
             "columns": self.shape[1],
             "wavelength": self.wavelength.tolist(),
             "colours": spectral_colours(self.wavelength),
-            "quantity": told.get("long_name", str(self._cube.name or "value")),
+            "quantity": told.get("long_name", str(self.cube.name or "value")),
             "unit": told.get("units", ""),
             "by_need": not self._held,
             "live": False,
@@ -136,7 +136,7 @@ class StoredCube:
 
     def spectra(self, ask: Spectra) -> tuple[np.ndarray, dict[str, Any]]:
         """Return mean and standard deviation, (2, N, K), and the pixels that count in each."""
-        cube = self._cube if not ask.layer else self._spectral(ask.layer)
+        cube = self.cube if not ask.layer else self._spectral(ask.layer)
         held = self._held and not ask.layer
         means, spreads, counts = [], [], []
         for region in ask.regions:
@@ -153,16 +153,16 @@ class StoredCube:
 
     def _colour(self, rows: slice, columns: slice, white: np.ndarray | None) -> np.ndarray:
         bands = slice(None)
-        if not self._held and self._cube.encoding.get("together", 1) == 1:
+        if not self._held and self.cube.encoding.get("together", 1) == 1:
             # Each band is a piece of disk of its own: about thirty tell the colour well enough.
             bands = slice(None, None, max(1, len(self.wavelength) // 32))
         weights = rgb_weights(self.wavelength[bands], None if white is None else white[bands])
         weights = weights.astype(np.float32)
-        blocks = self._blocks(rows, columns, self._cube, self._held, bands)
+        blocks = self._blocks(rows, columns, self.cube, self._held, bands)
         return np.concatenate([_along(block @ weights) for block in blocks], axis=1)
 
     def _angle(self, rows: slice, columns: slice, spectrum: np.ndarray) -> np.ndarray:
-        blocks = self._blocks(rows, columns, self._cube, self._held)
+        blocks = self._blocks(rows, columns, self.cube, self._held)
         return np.concatenate([np.asarray(sam(block, spectrum), np.float32) for block in blocks])
 
     def _layer(self, name: str, rows: slice, columns: slice, band: int) -> np.ndarray:
@@ -178,13 +178,13 @@ class StoredCube:
         if self._held:
             return self._whole()[rows, columns, index]
         size = _length(rows) * _length(columns) * 4
-        together = max(1, min(self._cube.encoding.get("together", 1), _KEPT // size))
+        together = max(1, min(self.cube.encoding.get("together", 1), _KEPT // size))
         first = index - index % together
         key = (rows.start, rows.stop, columns.start, columns.stop, first)
         with self._lock:
             if key not in self._kept:
                 bands = slice(first, min(first + together, len(self.wavelength)))
-                blocks = self._blocks(rows, columns, self._cube, False, bands)
+                blocks = self._blocks(rows, columns, self.cube, False, bands)
                 self._kept[key] = np.concatenate([_along(block) for block in blocks], axis=1)
                 while sum(each.nbytes for each in self._kept.values()) > _KEPT:
                     self._kept.popitem(last=False)
@@ -196,7 +196,7 @@ class StoredCube:
     def _whole(self) -> np.ndarray:
         with self._lock:
             if self._values is None:
-                self._values = np.asarray(self._cube, np.float32)
+                self._values = np.asarray(self.cube, np.float32)
             return self._values
 
     def _blocks(

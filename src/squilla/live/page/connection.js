@@ -11,7 +11,7 @@ export function unpack(buffer) {
 export class Connection {
   /**
    * @param {object} heard - called with what comes unasked: `hello(header)`, `frame(header, values)`,
-   *   `lost()`, `back()`.
+   *   `refused(sentence)`, `lost()`.
    */
   constructor(heard) {
     this.heard = heard;
@@ -40,7 +40,10 @@ export class Connection {
       return;
     }
     const asked = this.waiting.get(header.id);
-    if (!asked) return;
+    if (!asked) {
+      if (header.error) this.heard.refused(header.error);
+      return;
+    }
     this.waiting.delete(header.id);
     this.next();
     if (header.error) asked.reject(new Error(header.error));

@@ -42,6 +42,7 @@ const plot = new Plot($("plot"), {
 const connection = new Connection({
   hello: (header) => greet(header),
   frame: (header, values) => live.frame(header, values),
+  refused: (sentence) => live.refused(sentence),
   lost: () => warn("The viewer does not answer; trying again. If it was ended, start it in the terminal."),
 });
 
@@ -521,6 +522,8 @@ const KEYS = {
   e: exportSpectra,
   i: exportPicture,
   d: () => $("theme").click(),
+  f: () => { if (live.on) $("freeze").click(); },
+  ".": () => { if (live.on) $("step").click(); },
   "?": () => $("help").showModal(),
   Delete: () => { if (spectra.pins.length) remove(spectra.pins.at(-1)); },
   Escape: () => menu(false),
