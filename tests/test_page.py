@@ -275,7 +275,7 @@ def test_looking_closely_at_a_large_cube(browser, tmp_path):
 
         for x in range(80, 760, 70):
             end = time.monotonic() + 5
-            while not values[0, (found := under(x))[0], 2] == pytest.approx(found[1], rel=1e-3):
+            while values[0, (found := under(x))[0], 2] != pytest.approx(found[1], rel=1e-3):
                 assert time.monotonic() < end, found
         assert under(80)[0] + 9 < under(710)[0] + 1
         assert page.complaints() == []

@@ -2,7 +2,6 @@
 
 import http.client
 import json
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,9 +12,8 @@ import websockets
 import xarray as xr
 from typer.testing import CliRunner
 from websockets.frames import Frame, Opcode
-from websockets.sync.client import connect
 
-from serving import running
+from serving import Line, running
 from squilla.cli.app import app
 from squilla.errors import InputError
 from squilla.evaluation.metrics import sam
@@ -51,48 +49,15 @@ def file(cube, maps, tmp_path_factory) -> Path:
     return path
 
 
-def unpack(message: bytes) -> tuple[dict, np.ndarray | None]:
-    length = int.from_bytes(message[:4], "little")
-    header = json.loads(message[4 : 4 + length])
-    if "shape" not in header:
-        return header, None
-    return header, np.frombuffer(message[4 + length :], "<f4").reshape(header["shape"])
-
-
 @pytest.fixture(scope="module")
 def address(file) -> Iterator[str]:
     with running(StoredCube.open(file)) as place:
         yield place
 
 
-class Page:
-    """What the page does, without a page."""
-
-    def __init__(self, address: str, room: int = 1 << 20):
-        host, port = address.split(":")
-        line = socket.socket()
-        line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room)  # what may lie there unread
-        line.connect((host, int(port)))
-        self.socket = connect(
-            f"ws://{address}/socket",
-            origin=f"http://{address}",
-            sock=line,
-            compression=None,
-            max_size=None,
-        )
-        self.hello, _ = unpack(self.socket.recv())
-
-    def tell(self, text: str | bytes) -> tuple[dict, np.ndarray | None]:
-        self.socket.send(text)
-        return unpack(self.socket.recv(timeout=10))
-
-    def ask(self, **message) -> tuple[dict, np.ndarray | None]:
-        return self.tell(json.dumps({"id": 7, **message}))
-
-
 @pytest.fixture
-def page(address) -> Iterator[Page]:
-    page = Page(address)
+def page(address) -> Iterator[Line]:
+    page = Line(address)
     yield page
     page.socket.close()
 
@@ -269,7 +234,7 @@ def test_a_file_that_vanishes_is_said_on_the_page(cube, tmp_path):
         if chunk.is_file():
             chunk.write_bytes(b"rot")
     with running(source) as address:
-        page = Page(address)
+        page = Line(address)
         header, _ = page.ask(ask="picture", kind="band", band=0)
         assert "could not be read" in header["error"]
         header, _ = page.ask(ask="picture", kind="band", band=99)
@@ -351,13 +316,13 @@ def test_addresses():
 
 
 def test_messages_are_bounded(address):
-    page = Page(address)
+    page = Line(address)
     with pytest.raises(websockets.ConnectionClosed):
         page.ask(ask="reference", name="long", text="x" * (protocol.LARGEST + 8192))
     assert let_in(address, origin=f"http://{address}")
 
 
-def flood(page: Page, opcode: int, payload: bytes) -> int:
+def flood(page: Line, opcode: int, payload: bytes) -> int:
     """Send frames and read nothing until no more are taken; return the bytes that were."""
     raw, sent = page.socket.socket, 0
     raw.settimeout(0.5)
@@ -374,7 +339,7 @@ def flood(page: Page, opcode: int, payload: bytes) -> int:
 @pytest.mark.parametrize("kind", ["questions", "pings", "pieces"])
 def test_one_who_floods_stops_nobody(address, cube, kind):
     """What it sends is not taken any more, or it is thrown out; the others are served."""
-    deaf, other = Page(address, room=4096), Page(address)
+    deaf, other = Line(address, room=4096), Line(address)
     ask = {"id": 1, "ask": "spectra", "regions": [[0, 0, 30, 40]] * 32}
     opcode, payload = {
         "questions": (Opcode.TEXT, json.dumps(ask).encode()),
@@ -392,11 +357,11 @@ def test_one_who_floods_stops_nobody(address, cube, kind):
 
 
 def test_pages_are_counted(address):
-    pages = [Page(address) for _ in range(8)]
+    pages = [Line(address) for _ in range(8)]
     refused = 0
     for _ in range(16):
         try:
-            pages.append(Page(address))
+            pages.append(Line(address))
         except websockets.InvalidStatus:
             refused += 1
     assert refused >= 8

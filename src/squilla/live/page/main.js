@@ -26,7 +26,7 @@ const spectra = new Spectra();
 let sources = [], number = 0, playing = null, show = null;
 
 const view = new View($("picture"), {
-  select: (region, done) => select(region, done),
+  select: (region) => select(region),
   hover: (point) => readout(point),
   zoomed: () => {
     $("zoom").value = `${Math.round(view.scale * 100)} %`;
@@ -265,11 +265,12 @@ function setTool(pan) {
 
 // --- spectra -----------------------------------------------------------------------------------
 
-function select(region, done) {
+function select(region) {
   const item = spectra.select(region);
-  mark();
   if (live.on) live.watch();
-  else fetchSpectrum(item, done);
+  else fetchSpectrum(item);
+  mark();
+  listPlaces();
 }
 
 /** Fetch the spectrum of a place; while it is under way the place may move on. */

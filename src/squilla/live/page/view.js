@@ -23,7 +23,7 @@ class Image {
 export class View {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {object} told - called back: `select(region, done)`, `hover(point|null)`, `zoomed()`.
+   * @param {object} told - called back: `select(region)`, `hover(point|null)`, `zoomed()`.
    */
   constructor(canvas, told) {
     this.canvas = canvas;
@@ -258,7 +258,7 @@ export class View {
     } else {
       this.box = this.between(this.start, { x, y });
       this.told.hover(null);
-      this.told.select(this.box, false);
+      this.told.select(this.box);
       this.draw();
     }
   }
@@ -272,7 +272,7 @@ export class View {
     this.start = this.box = null;
     if (pinch || event.type === "pointercancel" || (pans && (moved || event.button > 0))) return;
     if (dragged) {
-      this.told.select(dragged, true);
+      this.told.select(dragged);
       return;
     }
     const point = this.pixel(event.offsetX, event.offsetY);
@@ -286,7 +286,7 @@ export class View {
 
   choose([row, column]) {
     this.cursor = [row, column];
-    this.told.select([row, column, row + 1, column + 1], true);
+    this.told.select([row, column, row + 1, column + 1]);
   }
 
   key(event) {
