@@ -15,7 +15,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from squilla.errors import InputError
-from squilla.files.cube import CUBE_SUFFIXES, labelled, load_cube, read_scene, save
+from squilla.files.cube import (
+    CUBE_SUFFIXES,
+    labelled,
+    load_cube,
+    open_cube,
+    read_scene,
+    save,
+)
 from squilla.files.disk import replacing
 from squilla.files.raw import Raw, read_raw, read_raws, write_raw
 
@@ -588,3 +595,45 @@ def test_wrong_bytes_do_no_harm(samples, tmp_path, name, data):
     wrong = data.draw(st.binary(min_size=1, max_size=8))
     with contextlib.suppress(InputError):
         _damage(samples, tmp_path, name, whole[:place] + wrong + whole[place + len(wrong) :])
+
+
+# --- read by need --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", CUBE_SUFFIXES)
+def test_opened_cubes_are_read_by_need(tmp_path, cube, suffix):
+    path = tmp_path / f"doll{suffix}"
+    uncertainty = (cube / 10).rename("uncertainty")
+    valid = (cube.isel(wavelength=0, drop=True) > 0.5).rename("valid")
+    save(cube, path, extra={"uncertainty": uncertainty, "valid": valid})
+    opened, extra = open_cube(path)
+    assert not opened.variable._in_memory
+    assert opened.shape == cube.shape
+    part = opened[1:5:2, 3, ::-1]
+    np.testing.assert_array_equal(part, cube[1:5:2, 3, ::-1])
+    np.testing.assert_array_equal(opened, cube)
+    assert not opened.variable._in_memory, "using a part must not keep the whole"
+    assert set(extra) == {"uncertainty", "valid"}
+    np.testing.assert_array_equal(extra["uncertainty"], uncertainty)
+    np.testing.assert_array_equal(np.asarray(extra["valid"], bool), valid)
+
+
+@pytest.mark.parametrize(("interleave", "together"), [("bsq", 1), ("bil", 1), ("bip", 5)])
+def test_opened_envi_of_any_order(tmp_path, cube, interleave, together):
+    """Bands backwards, one of them bad, an empty pixel: as when the cube is read whole."""
+    import spectral
+
+    values = cube.values[..., ::-1].copy()
+    values[2, 3] = -9999
+    told = {"wavelength": cube.wavelength.values[::-1].tolist(), "wavelength units": "nm"}
+    told |= {"bbl": [1, 1, 0, 1, 1], "data ignore value": -9999}
+    path = tmp_path / "other.hdr"
+    spectral.envi.save_image(str(path), values, metadata=told, interleave=interleave, force=True)
+    opened, extra = open_cube(path)
+    expected = cube.values[..., [0, 1, 3, 4]].copy()
+    expected[2, 3] = np.nan
+    np.testing.assert_array_equal(opened, expected)
+    np.testing.assert_array_equal(opened[2, 2:4, 1], expected[2, 2:4, 1])
+    assert not opened.variable._in_memory
+    assert opened.encoding["together"] == together
+    assert extra == {}

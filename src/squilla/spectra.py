@@ -296,6 +296,40 @@ def _sum_of_lines(
 
 # --- colour ---------------------------------------------------------------------------------
 
+_XYZ_TO_RGB = np.array(
+    [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+)  # Source: IEC 61966-2-1, sRGB
+
+_D65 = np.array([0.3127 / 0.3290, 1.0, (1 - 0.3127 - 0.3290) / 0.3290])
+"""The white of sRGB, XYZ."""
+
+
+@cache
+def _observer() -> tuple[np.ndarray, np.ndarray]:
+    """Return the CIE 1931 observer: wavelengths, nm, and colour matching functions (N, 3).
+
+    Source: CIE 015:2018; NOTICE, spectra/observer.npz.
+    """
+    with np.load(str(package_files("squilla") / "data" / "spectra" / "observer.npz")) as table:
+        return table["wavelength"], table["xyz"]
+
+
+def _matching(wavelength: np.ndarray) -> np.ndarray:
+    """Return what a photon of each band adds to the CIE 1931 observer's XYZ, (K, 3).
+
+    Parameters
+    ----------
+    wavelength : array, (K,)
+        nm, increasing; those that nobody sees add nothing.
+    """
+    wavelength = np.asarray(wavelength, float)
+    known, receptors = _observer()
+    matching = np.stack(
+        [np.interp(wavelength, known, each, left=0, right=0) for each in receptors.T], axis=-1
+    )
+    step = np.gradient(wavelength) if len(wavelength) > 1 else np.ones(1)
+    return matching * (step / wavelength)[:, None]  # photons to power
+
 
 def tristimulus(spectrum: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
     """Return what the three receptors of the CIE 1931 observer see, XYZ, in a scale of their own.
@@ -313,33 +347,16 @@ def tristimulus(spectrum: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
     -------
     array, (..., 3)
 
-    Source: CIE 015:2018 through colour-science.
+    Source: CIE 015:2018.
     """
-    import colour
-
-    wavelength = np.asarray(wavelength, float)
-    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    matching = np.stack(
-        [
-            np.interp(wavelength, observer.wavelengths, receptor, left=0, right=0)
-            for receptor in observer.values.T
-        ],
-        axis=-1,
-    )
-    step = np.gradient(wavelength) if len(wavelength) > 1 else np.ones(1)
-    matching = matching * (step / wavelength)[:, None]  # photons to power
     spectrum = np.asarray(spectrum)
-    return spectrum @ matching.astype(np.result_type(spectrum.dtype, np.float32))
+    return spectrum @ _matching(wavelength).astype(np.result_type(spectrum.dtype, np.float32))
 
 
-def rgb(
-    cube: np.ndarray,
-    wavelength: np.ndarray,
-    *,
-    white: np.ndarray | None = None,
-    exposure: float | None = None,
+def linear_rgb(
+    cube: np.ndarray, wavelength: np.ndarray, *, white: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the colour that the CIE 1931 observer sees in a cube, as sRGB.
+    """Return the colour that the CIE 1931 observer sees in a cube, as linear light of sRGB.
 
     Wavelengths outside the cube's band add nothing; adapting to `white`, which is cut to the same
     band, keeps white things white.
@@ -351,29 +368,60 @@ def rgb(
     wavelength : array, (K,)
         nm, increasing.
     white : array, (K,), optional
-        Spectrum that shall look white; the light of the scene. Default: equal at all wavelengths.
+        Spectrum that shall be (1, 1, 1); the light of the scene. Default: equal at all wavelengths.
+
+    Returns
+    -------
+    array, (..., 3)
+        Not clipped: colours outside sRGB have negative parts.
+
+    Source: CIE 015:2018; adaptation to D65 by XYZ scaling.
+    """
+    cube = np.asarray(cube)
+    return np.nan_to_num(cube) @ rgb_weights(wavelength, white).astype(
+        np.result_type(cube.dtype, np.float32)
+    )
+
+
+def rgb_weights(wavelength: np.ndarray, white: np.ndarray | None = None) -> np.ndarray:
+    """Return the matrix of `linear_rgb`, (K, 3): what each band adds to red, green and blue."""
+    white = np.ones(len(wavelength)) if white is None else np.asarray(white, float)
+    matching = _matching(wavelength)
+    white_xyz = white @ matching
+    luminance = max(float(white_xyz[1]), 1e-12)
+    # Von Kries scaling of X, Y, Z themselves, as in CIELAB. Sharper cone spaces make their blue
+    # from a difference: in a band that begins at 500 nm, with hardly any blue, mostly noise.
+    adapted = matching / luminance * (_D65 / np.maximum(white_xyz / luminance, 1e-6))
+    return adapted @ _XYZ_TO_RGB.T
+
+
+def rgb(
+    cube: np.ndarray,
+    wavelength: np.ndarray,
+    *,
+    white: np.ndarray | None = None,
+    exposure: float | None = None,
+) -> np.ndarray:
+    """Return the colour that the CIE 1931 observer sees in a cube, as sRGB.
+
+    Parameters
+    ----------
+    cube : array, (..., K)
+    wavelength : array, (K,)
+    white : array, (K,), optional
+        As in `linear_rgb`.
     exposure : float, optional
         Luminance relative to `white` that becomes 1; default: the 99th percentile of the cube.
 
     Returns
     -------
     array, (..., 3), 0..1, gamma encoded
-
-    Source: CIE 015:2018 through colour-science; adaptation to D65 by XYZ scaling.
     """
-    import colour
-
-    white = np.ones(len(wavelength)) if white is None else np.asarray(white, float)
-    white_xyz = tristimulus(white, wavelength)
-    xyz = tristimulus(np.nan_to_num(np.asarray(cube)), wavelength) / white_xyz[1]
+    linear = linear_rgb(cube, wavelength, white=white)
     if exposure is None:
-        exposure = float(np.percentile(xyz[..., 1], 99))
-    xyz = xyz / max(exposure, 1e-12)
-    # Von Kries scaling of X, Y, Z themselves, as in CIELAB. Sharper cone spaces make their blue
-    # from a difference: in a band that begins at 500 nm, with hardly any blue, mostly noise.
-    d65 = colour.xy_to_XYZ(colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"])
-    adapted = xyz * (d65 / np.maximum(white_xyz / white_xyz[1], 1e-6))
-    linear = np.clip(adapted @ colour.models.RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB.T, 0, 1)
+        # The luminance again, from the colours themselves.
+        exposure = float(np.percentile(linear @ np.linalg.inv(_XYZ_TO_RGB)[1], 99))
+    linear = np.clip(linear / max(exposure, 1e-12), 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 

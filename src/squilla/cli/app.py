@@ -7,6 +7,7 @@ import typer
 from squilla import __version__
 from squilla.cli import camera, filters, steps
 from squilla.cli.train import train
+from squilla.cli.view import live, view
 
 app = typer.Typer(
     name="squilla",
@@ -24,6 +25,8 @@ app.command()(steps.calibrate)
 app.command()(train)
 app.command()(steps.reconstruct)
 app.command()(steps.evaluate)
+app.command()(view)
+app.command()(live)
 app.command()(camera.models)
 
 

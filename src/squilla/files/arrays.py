@@ -10,6 +10,7 @@ from xarray import DataArray
 
 from squilla.errors import InputError
 from squilla.files.disk import check_size, reading
+from squilla.files.lazy import OnDisk, lazy
 
 _SPECTRAL = re.compile(r"wave|lambda|wvl|^wl|^bands?$|band_?(cent|wave)|cent(er|re)s?$", re.I)
 """Names that others give to a vector of wavelengths."""
@@ -33,7 +34,7 @@ def assemble(
 
     Returns
     -------
-    DataArray, (y, x, wavelength), of the type in the file
+    DataArray, (y, x, wavelength), of the type in the file; not yet read
     """
     vectors = [(None, wavelength)] if wavelength is not None else _vectors(arrays)
     cubes = {name: each for name, each in arrays.items() if len(each.shape) == 3}
@@ -64,9 +65,11 @@ def assemble(
         raise InputError(f"{path} holds several cubes, {sorted(names)}; choose one with variable=.")
     name, axis, vector = fits[0]
     units = str(vector.attrs.get("units", "")) if isinstance(vector, DataArray) else ""
-    values = np.moveaxis(np.asarray(arrays[name]), axis, -1)
     spectral = ("wavelength", np.asarray(vector, float).ravel(), {"units": units})
-    return DataArray(values, {"wavelength": spectral}, ("y", "x", "wavelength"), name)
+    each = arrays[name]
+    stored = each.variable if isinstance(each, DataArray) else np.asarray(each)
+    axes = (*(other for other in range(3) if other != axis), axis)
+    return lazy(OnDisk(stored, axes), {"wavelength": spectral}, name, {})
 
 
 def _vectors(arrays: Mapping[str, Any]) -> list[tuple[str | None, Any]]:
@@ -95,7 +98,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 def read_npy(path: Path) -> dict[str, np.ndarray]:
     """Read the one array of a .npy, under the name "cube"."""
     with reading(path, "NPY"):  # mapped, so that a header without its data is refused
-        return _numeric({"cube": np.array(np.load(path, mmap_mode="r", allow_pickle=False))})
+        return _numeric({"cube": np.load(path, mmap_mode="r", allow_pickle=False)})
 
 
 def read_mat(path: Path) -> dict[str, np.ndarray]:

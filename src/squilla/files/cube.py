@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,14 @@ from squilla.errors import InputError
 from squilla.files.arrays import assemble, read_mat, read_npy, read_npz
 from squilla.files.disk import check_size, existing, reading, replacing
 from squilla.files.envi import DATA_SUFFIXES, read_envi, write_envi
+from squilla.files.lazy import DIMS
+from squilla.files.tiff import open_tiff, write_tiff
 
 CUBE_SUFFIXES = (".nc", ".hdr", ".tiff", ".tif", ".zarr")
 """What `save` writes and `load_cube` reads."""
 
 SCENE_SUFFIXES = (*CUBE_SUFFIXES, *DATA_SUFFIXES, ".npz", ".npy", ".mat")
 """What `read_scene` reads."""
-
-_DIMS = ("y", "x", "wavelength")
 
 _CF = {"standard_name": "radiation_wavelength", "long_name": "wavelength", "units": "nm"}
 
@@ -49,7 +50,7 @@ def labelled(
     DataArray, (y, x, wavelength), with the CF attributes of a wavelength in nm
     """
     coordinate = ("wavelength", np.asarray(wavelength, float), _CF)
-    return DataArray(values, {"wavelength": coordinate}, _DIMS, name, dict(attributes or {}))
+    return DataArray(values, {"wavelength": coordinate}, DIMS, name, dict(attributes or {}))
 
 
 def save(
@@ -114,7 +115,53 @@ def load_cube(path: str | Path) -> DataArray:
     path = existing(path)
     if path.suffix.lower() not in CUBE_SUFFIXES:
         raise InputError(f"{path} must end in one of {', '.join(CUBE_SUFFIXES)} to be a cube.")
-    return _in_nanometres(_read(path, None, None), path)
+    return _read(path)
+
+
+def open_cube(
+    path: str | Path,
+    *,
+    wavelength: np.ndarray | str | Path | None = None,
+    variable: str | None = None,
+) -> tuple[DataArray, dict[str, DataArray]]:
+    """Open a cube, ours or others', whose numbers stay on disk until they are used.
+
+    ENVI, NetCDF, Zarr, NPY and plain TIFF are read by need; the other kinds at once.
+
+    Parameters
+    ----------
+    path, wavelength, variable
+        As in `read_scene`.
+
+    Returns
+    -------
+    cube : DataArray, (y, x, wavelength)
+        Each use reads anew; ``cube.encoding["together"]`` is the number of bands that the disk
+        must bring when one is wanted.
+    extra : dict of name to DataArray, (y, x) or (y, x, wavelength)
+        What `save` wrote with it.
+
+    Raises
+    ------
+    InputError
+        As `read_scene`; values are not looked at.
+    """
+    path = existing(path)
+    if path.suffix.lower() not in SCENE_SUFFIXES:
+        raise InputError(f"{path} is none of the scenes known: {', '.join(SCENE_SUFFIXES)}.")
+    if isinstance(wavelength, str | Path):
+        wavelength = _read_vector(existing(wavelength))
+    given = None if wavelength is None else np.asarray(wavelength, float).ravel()
+    stored, extra = _open(path, variable, given)
+    cube = _in_nanometres(stored, path)
+    cube.encoding["together"] = stored.encoding["together"]
+    order = np.argsort(stored["wavelength"].values, kind="stable")
+    if (np.diff(order) != 1).any():
+        extra = {
+            name: each.isel(wavelength=order) if each.ndim == 3 else each
+            for name, each in extra.items()
+        }
+    return cube, extra
 
 
 def read_scene(
@@ -146,13 +193,7 @@ def read_scene(
         If the file is missing, damaged or foreign; if there are no wavelengths, or one occurs
         twice; if values are NaN or infinite, or none is above zero.
     """
-    path = existing(path)
-    if path.suffix.lower() not in SCENE_SUFFIXES:
-        raise InputError(f"{path} is none of the scenes known: {', '.join(SCENE_SUFFIXES)}.")
-    if isinstance(wavelength, str | Path):
-        wavelength = _read_vector(existing(wavelength))
-    given = None if wavelength is None else np.asarray(wavelength, float).ravel()
-    scene = _in_nanometres(_read(path, variable, given), path)
+    scene = _read(path, variable=variable, wavelength=wavelength)
     with np.errstate(over="ignore"):
         values = np.ascontiguousarray(scene.values, np.float32)
     if not np.isfinite(values).all():
@@ -167,13 +208,13 @@ def read_scene(
 
 def _checked(cube: DataArray) -> DataArray:
     """Return the cube as (y, x, wavelength) if it is one that can be written."""
-    if set(cube.dims) != set(_DIMS) or cube.size == 0:
-        raise InputError(f"A cube has the dims {_DIMS}; this one has {dict(cube.sizes)}.")
+    if set(cube.dims) != set(DIMS) or cube.size == 0:
+        raise InputError(f"A cube has the dims {DIMS}; this one has {dict(cube.sizes)}.")
     if "wavelength" not in cube.coords:
         raise InputError('The cube has no coordinate "wavelength"; assign its wavelengths in nm.')
     if cube.dtype.kind not in "iuf":
         raise InputError(f"A cube holds real numbers; this one holds {cube.dtype}.")
-    cube = cube.transpose(*_DIMS)
+    cube = cube.transpose(*DIMS)
     cube = cube.assign_coords(wavelength=cube["wavelength"].assign_attrs(_CF))
     if not (np.diff(cube["wavelength"]) > 0).all():
         raise InputError("The wavelengths of a cube must increase from band to band.")
@@ -212,10 +253,10 @@ def _in_nanometres(cube: DataArray, path: Path) -> DataArray:
             f"{path}: wavelengths from {wavelength.min():g} to {wavelength.max():g} nm make no "
             "sense; give the right ones with wavelength=, in nm."
         )
-    result = labelled(cube.values, wavelength, name=str(cube.name), attributes=cube.attrs)
-    for name, coordinate in cube.drop_vars("wavelength").coords.items():
-        values = coordinate.values * factor if name == "fwhm" else coordinate.values
-        result = result.assign_coords({name: (coordinate.dims, values, coordinate.attrs)})
+    result = cube.assign_coords(wavelength=("wavelength", wavelength, _CF))
+    if "fwhm" in cube.coords:
+        width = cube["fwhm"]
+        result = result.assign_coords(fwhm=(width.dims, width.values * factor, width.attrs))
     order = np.argsort(wavelength, kind="stable")
     twice = wavelength[order][:-1][np.diff(wavelength[order]) == 0]
     if len(twice):
@@ -247,49 +288,81 @@ def _read_vector(path: Path) -> np.ndarray:
 # --- one reader and one writer for each kind --------------------------------------------------
 
 
-def _read(path: Path, variable: str | None, wavelength: np.ndarray | None) -> DataArray:
+def _read(path: str | Path, **how: Any) -> DataArray:
+    cube, _ = open_cube(path, **how)
+    with reading(Path(path), "cube"):
+        return cube.load()
+
+
+def _open(
+    path: Path, variable: str | None, wavelength: np.ndarray | None
+) -> tuple[DataArray, dict[str, DataArray]]:
     suffix = path.suffix.lower()
     if suffix == ".nc":
-        return _read_dataset(path, variable, wavelength, kind="NetCDF")
+        return _open_dataset(path, variable, wavelength, kind="NetCDF")
     if suffix == ".zarr":
         need_zarr(path)
-        return _read_dataset(
+        return _open_dataset(
             path, variable, wavelength, kind="Zarr", engine="zarr", consolidated=False
         )
     if suffix in (".npz", ".npy", ".mat"):
         reader = {".npz": read_npz, ".npy": read_npy, ".mat": read_mat}[suffix]
-        return assemble(reader(path), path, variable, wavelength)
-    cube = _read_tiff(path) if suffix in (".tif", ".tiff") else read_envi(path)
-    if wavelength is None:
-        return cube
-    if len(wavelength) != cube.sizes["wavelength"]:
-        raise InputError(
-            f"{path} has {cube.sizes['wavelength']} bands, but {len(wavelength)} wavelengths are "
-            "given."
-        )
-    return cube.drop_vars("fwhm", errors="ignore").assign_coords(wavelength=wavelength)
+        return assemble(reader(path), path, variable, wavelength), {}
+    one = open_tiff if suffix in (".tif", ".tiff") else read_envi
+    cube = one(path)
+    if wavelength is not None:
+        if len(wavelength) != cube.sizes["wavelength"]:
+            raise InputError(
+                f"{path} has {cube.sizes['wavelength']} bands, but {len(wavelength)} wavelengths "
+                "are given."
+            )
+        cube = cube.drop_vars("fwhm", errors="ignore").assign_coords(wavelength=wavelength)
+    return cube, _beside(path, cube, one)
 
 
-def _read_dataset(
+def _open_dataset(
     path: Path, variable: str | None, wavelength: np.ndarray | None, *, kind: str, **how: Any
-) -> DataArray:
+) -> tuple[DataArray, dict[str, DataArray]]:
     import h5py
 
     with reading(path, kind):
         if path.is_file() and h5py.is_hdf5(path):
             h5py.File(path, "r").close()  # says in plain words what is wrong with a damaged file
-        dataset = xr.open_dataset(path, decode_times=False, **how)
-    with reading(path, kind), dataset:
+        dataset = xr.open_dataset(path, decode_times=False, cache=False, **how)
         arrays = {str(name): dataset[name] for name in dataset.variables}
-        arrays = {name: each for name, each in arrays.items() if each.dtype.kind in "iuf"}
+        arrays = {name: each for name, each in arrays.items() if each.dtype.kind in "iufb"}
         check_size(path, sum(each.nbytes for each in arrays.values()))
         variable = variable or dataset.attrs.get("cube")
-        cube = assemble(arrays, path, variable, wavelength)
+        numbers = {name: each for name, each in arrays.items() if each.dtype.kind != "b"}
+        cube = assemble(numbers, path, variable, wavelength)
         cube.attrs = dict(dataset[cube.name].attrs)
         for name, coordinate in dataset[cube.name].coords.items():
-            if name != "wavelength" and set(coordinate.dims) <= set(_DIMS):
+            if name != "wavelength" and set(coordinate.dims) <= set(DIMS):
                 cube = cube.assign_coords({name: coordinate.load()})
-        return cube
+        sizes = dataset[cube.name].sizes
+        extra = {
+            name: each
+            for name, each in arrays.items()
+            if name in dataset.data_vars and name != cube.name and each.dims in (DIMS[:2], DIMS)
+            if all(each.sizes[dim] == sizes.get(dim) for dim in each.dims)
+        }
+    return cube, extra
+
+
+def _beside(path: Path, cube: DataArray, one: Callable[[Path], DataArray]) -> dict[str, DataArray]:
+    """Open what `save` wrote beside an ENVI or TIFF cube: doll-uncertainty.hdr beside doll.hdr."""
+    extra = {}
+    for other in sorted(path.parent.glob(f"{escape(path.stem)}-*{path.suffix}")):
+        try:
+            beside = one(other)
+        except InputError:  # somebody else's file is none of ours to complain of
+            continue
+        if other.stem != f"{path.stem}-{beside.name}" or beside.shape[:2] != cube.shape[:2]:
+            continue
+        if "wavelength" not in beside.coords and beside.shape[2] == 1:
+            beside = beside.isel(wavelength=0)
+        extra[str(beside.name)] = beside
+    return extra
 
 
 def _write_netcdf(dataset: xr.Dataset, path: Path) -> None:
@@ -337,50 +410,8 @@ def zarr_encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
 
 
 def _write_single(array: DataArray, path: Path) -> None:
-    if array.dims[:2] != _DIMS[:2] or array.ndim > 3:
+    if array.dims[:2] != DIMS[:2] or array.ndim > 3:
         raise InputError(f"{path} cannot hold {array.name} of {array.dims}; use .nc or .zarr.")
     if array.dtype == bool:
         array = array.astype(np.uint8)
-    (write_envi if path.suffix.lower() == ".hdr" else _write_tiff)(array, path)
-
-
-def _write_tiff(array: DataArray, path: Path) -> None:
-    import tifffile
-
-    bands = array.values.reshape(*array.shape[:2], -1).transpose(2, 0, 1)
-    told: dict[str, Any] = {"name": array.name, "attributes": array.attrs}
-    for key in ("wavelength", "fwhm"):
-        if key in array.coords:
-            told[key] = array[key].values.tolist()
-    with replacing(path) as temporary:
-        tifffile.imwrite(
-            temporary,
-            np.ascontiguousarray(bands),
-            photometric="minisblack",
-            description=json.dumps(told),
-            metadata=None,
-        )
-
-
-def _read_tiff(path: Path) -> DataArray:
-    import tifffile
-
-    with reading(path, "TIFF"), tifffile.TiffFile(path) as tiff:
-        first = tiff.pages.first
-        check_size(path, len(tiff.pages) * first.nbytes)
-        bands = np.stack([page.asarray() for page in tiff.pages])
-        if bands.ndim != 3:
-            raise InputError(f"{path} must hold one grey page for each band.")
-        try:
-            told = json.loads(first.description)
-        except ValueError:
-            told = None
-        if not isinstance(told, dict) or "wavelength" not in told:
-            told = {"name": path.stem, "attributes": {}}  # others' files describe other things
-        coords = {
-            key: ("wavelength", np.array(told[key], float))
-            for key in ("wavelength", "fwhm")
-            if key in told
-        }
-        values = np.ascontiguousarray(bands.transpose(1, 2, 0))
-        return DataArray(values, coords, _DIMS, told["name"], told["attributes"])
+    (write_envi if path.suffix.lower() == ".hdr" else write_tiff)(array, path)

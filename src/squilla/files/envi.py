@@ -11,6 +11,7 @@ from xarray import DataArray
 
 from squilla.errors import InputError
 from squilla.files.disk import existing, flush, reading, replacing
+from squilla.files.lazy import OnDisk, lazy
 
 DATA_SUFFIXES = (".img", ".dat", ".raw", ".bsq", ".bil", ".bip", ".bin", ".cube")
 
@@ -69,7 +70,7 @@ def write_envi(array: DataArray, path: Path) -> None:
 
 
 def read_envi(path: Path) -> DataArray:
-    """Read an ENVI cube, (y, x, wavelength) of the type on disk.
+    """Open an ENVI cube, (y, x, wavelength) of the type on disk; its numbers are read when used.
 
     Parameters
     ----------
@@ -106,29 +107,27 @@ def read_envi(path: Path) -> DataArray:
     size = {"b": count, "l": lines, "s": samples}
     axes = _AXES[interleave]
     stored = np.memmap(data, dtype, "r", offset, tuple(size[axis] for axis in axes))
-    values = stored.transpose([axes.index(axis) for axis in "lsb"])
-    coords, attributes = {}, {}
+    coords, attributes, name = {}, {}, path.stem
     for key in ("wavelength", "fwhm"):
         if key in header:
             coords[key] = ("wavelength", _numbers(header, key, count, path))
     if "wavelength" in coords:
         coords["wavelength"] += ({"units": str(header.get("wavelength units", ""))},)
-    if "bbl" in header:
-        good = _numbers(header, "bbl", count, path) > 0
-        values = values[..., good]
-        coords = {key: (dim, each[good], *rest) for key, (dim, each, *rest) in coords.items()}
+    empty = None
     if "data ignore value" in header:
         with reading(path, "ENVI"):
-            empty = values == float(header["data ignore value"])
-        if empty.any():
-            values = np.where(empty, np.nan, values)
-    name = path.stem
+            empty = float(header["data ignore value"])
     if "squilla" in header:
         with reading(path, "ENVI"):
             ours = json.loads(unquote(header["squilla"]))
             name, attributes = ours["name"], ours["attributes"]
-    values = np.array(values, values.dtype.newbyteorder("="), order="C")  # off the disk
-    return DataArray(values, coords, ("y", "x", "wavelength"), name, attributes)
+    on_disk = OnDisk(stored, tuple(axes.index(axis) for axis in "lsb"), empty)
+    with reading(path, "ENVI"):
+        cube = lazy(on_disk, coords, name, attributes)
+    if "bbl" in header:
+        cube = cube.isel(wavelength=_numbers(header, "bbl", count, path) > 0)
+        cube.encoding["together"] = on_disk.together
+    return cube
 
 
 def _pair(path: Path) -> tuple[Path, Path]:

@@ -1,0 +1,108 @@
+"""Recording of live frames: raw TIFF files in a folder, or cubes in one Zarr."""
+
+import queue
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from squilla.errors import InputError
+from squilla.files.raw import Raw, write_raw
+from squilla.live.stored import StoredCube
+
+_WAITING = 2
+"""Frames that may wait for the disk; with more a frame is missed, and counted."""
+
+
+class Recorder:
+    """Writes frames in a thread of its own, so that a slow disk never stops the camera.
+
+    Parameters
+    ----------
+    path : Path
+        A folder, for raw frames ``frame-000001.tiff``; or a name that ends in .zarr, for the
+        reconstructed cubes, one after the other along "time". What is there is gone on with, never
+        overwritten.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made, or a Zarr of that name exists.
+    """
+
+    def __init__(self, path: Path):
+        self.path, self.cubes = path, path.suffix == ".zarr"
+        self.written = self.missed = 0
+        self.error: str | None = None
+        self._waiting: queue.Queue[tuple[Raw, Callable[[], StoredCube]] | None] = queue.Queue(
+            _WAITING
+        )
+        self._thread: threading.Thread | None = None
+        if self.cubes and path.exists():
+            raise InputError(f"{path} exists already; name another to record to.")
+        try:
+            (path.parent if self.cubes else path).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"The folder {path} cannot be made: {error.strerror}.") from error
+        names = [] if self.cubes else [file.stem[6:] for file in path.glob("frame-*.tiff")]
+        self._number = max((int(name) for name in names if name.isdecimal()), default=0)
+
+    @property
+    def running(self) -> bool:
+        """Whether frames are taken."""
+        return self._thread is not None
+
+    def start(self) -> None:
+        """Take frames from now on."""
+        if self._thread is None:
+            self.error = None
+            self._thread = threading.Thread(target=self._run, daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """Write what waits, then take no more."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            self._waiting.put(None)
+            thread.join()
+
+    def offer(self, raw: Raw, cube: Callable[[], StoredCube]) -> None:
+        """Hand over a frame; it is missed if the disk is behind."""
+        try:
+            self._waiting.put_nowait((raw, cube))
+        except queue.Full:
+            self.missed += 1
+
+    def _run(self) -> None:
+        while (item := self._waiting.get()) is not None:
+            if self.error is not None:
+                self.missed += 1
+                continue
+            raw, cube = item
+            try:
+                if self.cubes:
+                    self._append(cube())
+                else:
+                    self._number += 1
+                    write_raw(self.path / f"frame-{self._number:06d}.tiff", raw)
+                self.written += 1
+            except (InputError, OSError) as error:  # a full disk: told on the page
+                self.error = str(error)
+
+    def _append(self, stored: StoredCube) -> None:
+        from zarr.codecs import BloscCodec
+
+        cube = stored.cube.astype(np.float32).rename("radiance").expand_dims("time")
+        cube.attrs = {}
+        dataset = cube.to_dataset()
+        if self.path.exists():
+            dataset.to_zarr(self.path, append_dim="time", zarr_format=3, consolidated=False)
+            return
+        packed = BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")
+        encoding = {"radiance": {"compressors": (packed,), "chunks": (1, *_tiles(cube.shape[1:]))}}
+        dataset.to_zarr(self.path, zarr_format=3, consolidated=False, encoding=encoding)
+
+
+def _tiles(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return (min(shape[0], 128), min(shape[1], 128), shape[2])

@@ -1,0 +1,239 @@
+"""The live view: the newest frame, right numbers, wishes to the camera, recording."""
+
+import json
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+
+from browser import MISSING, Browser, find
+from serving import Line, running
+from squilla.calibration.alignment import measure
+from squilla.errors import InputError
+from squilla.files.raw import Raw, read_raws, write_raw
+from squilla.live.pipeline import LiveSource
+from squilla.live.protocol import Picture, Spectra
+from squilla.live.record import Recorder
+from squilla.live.source import Counts, FolderFrames, MovingTwin, open_source
+from squilla.reconstruction.reconstructor import load_model
+
+
+class Stack:
+    """A camera that shows given frames, the last one again and again."""
+
+    def __init__(self, frames: list[Raw]):
+        self.frames, self.statistics = frames, Counts()
+        self.exposure: float | None = frames[0].exposure
+        self.held = 0
+
+    def read(self, *, timeout: float = 5.0) -> Raw:
+        time.sleep(0.01)
+        raw = self.frames[min(self.statistics.delivered, len(self.frames) - 1)]
+        self.statistics.delivered += 1
+        return raw
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def frames(camera, scene) -> list[Raw]:
+    rate = camera.rate(scene)
+    generator = torch.Generator().manual_seed(1)
+    exposure = camera.sensor.exposure_for(camera._fields(rate), 30.0)
+    return [camera.expose(rate * (1 + 0.1 * n), exposure, generator) for n in range(3)]
+
+
+@pytest.fixture
+def live(frames, calibration) -> Iterator[LiveSource]:
+    source = LiveSource(Stack(frames), calibration, load_model("ridge", calibration))
+    yield source
+    source.close()
+
+
+def until(test, seconds: float = 20.0):
+    end = time.monotonic() + seconds
+    while not (value := test()):
+        assert time.monotonic() < end, "never came true"
+        time.sleep(0.01)
+    return value
+
+
+def test_a_live_frame_is_what_measuring_and_reconstructing_give(live, frames, calibration):
+    frame = until(lambda: (now := live.now()).number >= 3 and now)
+    cube = load_model("ridge", calibration).reconstruct(measure(frames[-1], calibration)).values
+    picture, _ = frame.picture(Picture(kind="band", band=7))
+    np.testing.assert_allclose(picture[0], cube[..., 7], rtol=1e-5)
+    (mean, _), _ = frame.spectra(Spectra(regions=[(10, 20, 11, 21)]))
+    np.testing.assert_allclose(mean[0], cube[10, 20], rtol=1e-5)
+    told = frame.status()
+    assert told["exposure"] == frames[-1].exposure
+    assert told["distance"] == pytest.approx(300, rel=0.1)
+    assert told["saturated"] == 0
+    assert {"frame", "measure", "reconstruct"} <= told["stages"].keys()
+
+
+def test_freeze_and_step(live):
+    until(lambda: live.now().number >= 3)
+    live.control("frozen", True)
+    time.sleep(0.2)  # what was under way arrives
+    number = live.now().number
+    time.sleep(0.3)
+    assert live.now().number == number
+    live.control("step", None)
+    until(lambda: live.now().number == number + 1)
+    time.sleep(0.3)
+    assert live.now().number == number + 1
+    live.control("frozen", False)
+    until(lambda: live.now().number > number + 2)
+
+
+def test_nobody_looking_nothing_is_measured(live, monkeypatch):
+    monkeypatch.setattr("squilla.live.pipeline._ATTENTION", 0.1)
+    until(lambda: live.now().number >= 2)
+    time.sleep(0.5)
+    number = live._frame.number
+    time.sleep(0.3)
+    assert live._frame.number == number
+    until(lambda: live.now().number > number)
+
+
+def test_trouble_is_told_and_passes(frames, calibration):
+    dark = Raw(np.zeros_like(frames[0].frame) + 64, frames[0].exposure, frames[0].metadata)
+    stack = Stack([frames[0], dark])
+    source = LiveSource(stack, calibration, load_model("ridge", calibration))
+    error = until(lambda: source.now().status()["error"])
+    assert "dark" in error
+    stack.frames = [frames[0]]
+    until(lambda: source.now().status()["error"] is None)
+    source.close()
+
+
+def test_wishes(live):
+    assert live.control("exposure", 3.5)["exposure"] == 3.5
+    for value in (None, True):
+        with pytest.raises(InputError, match="number of ms"):
+            live.control("exposure", value)
+    with pytest.raises(InputError, match="--record"):
+        live.control("recording", True)
+
+
+@pytest.mark.parametrize("name", ["frames", "cubes.zarr"])
+def test_recording(frames, calibration, tmp_path, name):
+    recorder = Recorder(tmp_path / name)
+    source = LiveSource(
+        Stack(frames), calibration, load_model("ridge", calibration), recorder=recorder
+    )
+    source.control("recording", True)
+    until(lambda: recorder.written >= 3)
+    told = source.control("recording", False)
+    source.close()
+    assert told["recorded"] == recorder.written >= 3
+    assert recorder.error is None
+    if name == "frames":
+        back = list(read_raws(tmp_path / name))
+        assert len(back) == told["recorded"]
+        assert any(np.array_equal(back[-1].frame, each.frame) for each in frames)
+        assert back[0].exposure == frames[0].exposure
+        assert Recorder(tmp_path / name)._number == told["recorded"], "gone on with, not replaced"
+    else:
+        with xr.open_zarr(tmp_path / name, consolidated=False) as back:
+            assert back.radiance.dims == ("time", "y", "x", "wavelength")
+            assert back.sizes["time"] == told["recorded"]
+        with pytest.raises(InputError, match="exists"):
+            Recorder(tmp_path / name)
+
+
+def test_the_twin_moves_and_obeys(camera, scene, calibration):
+    twin = MovingTwin(camera, scene, poses=3, rate=50)
+    until(lambda: len(twin._rates) == 3)
+    seen = []
+
+    def both_ways() -> bool:
+        seen.append(measure(twin.read(), calibration).provenance["distance"])
+        return min(seen) < 275 and max(seen) > 325
+
+    until(both_ways)
+    before = twin.read().frame.mean()
+    twin.exposure = twin.exposure / 4
+    assert twin.read().frame.mean() < 0.5 * before
+    with pytest.raises(InputError, match="exposure"):
+        twin.exposure = float("nan")
+    twin.close()
+
+
+def test_a_folder_is_played_again_and_again(frames, tmp_path):
+    for number, raw in enumerate(frames):
+        write_raw(tmp_path / f"{number}.tiff", raw)
+    source = open_source(str(tmp_path), "thesis", "chart")
+    assert isinstance(source, FolderFrames)
+    for number in (0, 1, 2, 0, 1):
+        np.testing.assert_array_equal(source.read().frame, frames[number].frame)
+    assert source.exposure is None
+    with pytest.raises(InputError, match="taken with"):
+        source.exposure = 3.0
+    for wrong in ("webcam", str(tmp_path / "none")):
+        with pytest.raises(InputError, match="twin"):
+            open_source(wrong, "thesis", "chart")
+
+
+# --- over the line ------------------------------------------------------------------------------
+
+
+def test_frames_wait_for_the_page(live):
+    """A page gets the newest frame, and the next one only when it has shown this one."""
+    with running(live) as address:
+        line = Line(address)
+        wanted = [
+            {"kind": "band", "band": 3, "id": 5},
+            {"ask": "spectra", "regions": [[0, 0, 9, 9]]},
+        ]
+        line.socket.send(json.dumps({"ask": "watch", "wanted": wanted}))
+        seen = []
+        for _ in range(3):
+            parts = [line.receive() for _ in range(3)]
+            number = parts[0][0]["frame"]
+            assert [header["frame"] for header, _ in parts] == [number] * 3
+            assert parts[0][1].shape == (1, 60, 60)
+            assert parts[1][1].shape == (2, 1, 51)
+            assert parts[2][0]["last"]
+            with pytest.raises(TimeoutError):
+                line.socket.recv(timeout=0.2)
+            seen.append(number)
+            line.socket.send(json.dumps({"ask": "acknowledge", "frame": number}))
+        assert seen[0] < seen[1] < seen[2]
+        line.socket.close()
+
+
+@pytest.mark.skipif(find() is None, reason=MISSING)
+def test_the_page_shows_the_twin_alive(camera, scene, calibration, tmp_path):
+    """Pictures and spectra change by themselves; freezing stops them, exposure reaches the twin."""
+    twin = MovingTwin(camera, scene, poses=3, rate=30)
+    model = load_model("ridge", calibration)
+    source = LiveSource(twin, calibration, model, recorder=Recorder(tmp_path / "frames"))
+    with running(source) as address, Browser() as browser:
+        page = browser.page()
+        page.open(f"http://{address}/")
+        page.wait("performance.getEntriesByName('squilla first picture').length > 0", 30)
+        page.click("#picture")
+        value = "document.querySelector('#spectra td.number').innerText"
+        first = page.wait(f"({value}).replace('…', '')")
+        page.wait(f"{value} != '{first}'")
+        page.js("document.querySelector('#exposure').focus()")
+        page.js("(e => { e.value = 1.25; e.dispatchEvent(new Event('change')); })"
+                "(document.querySelector('#exposure'))")  # fmt: skip
+        until(lambda: twin.exposure == 1.25)
+        page.click("#record")
+        page.wait("document.querySelector('#recorded').innerText.includes('recorded')")
+        page.click("#freeze")
+        page.wait("document.querySelector('#freeze').getAttribute('aria-pressed') == 'true'")
+        time.sleep(0.5)
+        still = page.js(value)
+        time.sleep(0.5)
+        assert page.js(value) == still
+        assert "/s" in str(page.js("document.querySelector('#facts').innerText"))
+        assert page.complaints() == []
+    source.close()
