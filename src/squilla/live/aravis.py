@@ -236,7 +236,6 @@ class AravisConnection:
             for what in ("vendor_name", "model_name", "device_serial_number")
         )
         self.info = CameraInfo(f"genicam:{name}", vendor, model, serial)
-        self.sensor = Region(*self._integers(lib.arv_camera_get_sensor_size, 2)[::-1])
         count = c_uint()
         names = lib.arv_camera_dup_available_pixel_formats_as_strings(camera, byref(count))
         listed = ctypes.cast(names, POINTER(c_char_p))[: count.value] if names else []
@@ -262,6 +261,11 @@ class AravisConnection:
         low, high = c_double(), c_double()
         function(self._camera, byref(low), byref(high))
         return low.value, high.value
+
+    @property
+    def sensor(self) -> Region:
+        columns, rows = self._integers(self._lib.arv_camera_get_sensor_size, 2)
+        return Region(rows, columns)
 
     def set_format(self, name: str) -> None:
         self._lib.arv_camera_set_pixel_format_from_string(self._camera, name.encode())
@@ -330,8 +334,9 @@ class AravisConnection:
         if not buffer:
             return None
         complete = lib.arv_buffer_get_status(buffer) == _COMPLETE
-        shape, code, data = (0, 0), 0, np.empty(0, np.uint8)
-        if complete:  # else the library may not know what it holds
+        number, shape, code, data = None, (0, 0), 0, np.empty(0, np.uint8)
+        if complete:  # else the packet that tells all this may be lost, and older facts stand there
+            number = lib.arv_buffer_get_frame_id(buffer)
             shape = tuple(
                 getattr(lib, f"arv_buffer_get_image_{side}")(buffer) for side in ("height", "width")
             )
@@ -341,7 +346,7 @@ class AravisConnection:
             data = np.frombuffer((ctypes.c_uint8 * size.value).from_address(start), np.uint8)
         return Arrival(
             complete=complete,
-            number=lib.arv_buffer_get_frame_id(buffer),
+            number=number,
             timestamp=lib.arv_buffer_get_timestamp(buffer),
             code=code,
             shape=shape,

@@ -49,7 +49,7 @@ class Arrival:
     """One frame as it came, in memory that is lent until `release` is called.
 
     complete : False if packets of it were lost.
-    number : the camera's count; None if unknown, which stands for the one after the last.
+    number : the camera's count; None where it was lost, which stands for the one after the last.
     timestamp : ns of the camera's own clock.
     code : of the pixel format.
     shape : (rows, columns).
@@ -73,11 +73,15 @@ class Connection(Protocol):
     """
 
     info: CameraInfo
-    sensor: Region
     buffers: int
     formats: list[str]
     exposures: tuple[float, float] | None
     gains: tuple[float, float] | None
+
+    @property
+    def sensor(self) -> Region:
+        """All of the sensor, whatever part of it is read."""
+        ...
 
     def set_format(self, name: str) -> None: ...
 

@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 from squilla.live.connection import Arrival, CameraInfo, CameraLost, Connection, Region
@@ -113,7 +111,7 @@ class LiveCamera:
         self._report = report or (lambda sentence: None)
         self._lock = threading.RLock()
         self._statistics, self._last = Statistics(), None
-        self._streaming = self._closed = False
+        self._streaming = self._gone = self._closed = False
         self._lost_since: float | None = None
         self._connection = connection = connect()
         try:
@@ -136,14 +134,14 @@ class LiveCamera:
         """Bring a camera that was just opened to the wanted settings."""
         for name, value in self._settings.items():
             getattr(connection, f"set_{name}")(value)
-        self._connection, self._streaming = connection, False
+        self._connection, self._streaming, self._gone = connection, False, False
         self._read_back()
 
     def _read_back(self) -> None:
         """Remember what the camera made of its settings, which spares asking for every frame."""
         connection = self._connection
         self._exposure, self._gain = connection.exposure, connection.gain
-        self._region = connection.region
+        self._region, self._sensor = connection.region, connection.sensor
 
     def close(self) -> None:
         """Let go of the camera; another program may then open it."""
@@ -173,7 +171,7 @@ class LiveCamera:
     @property
     def sensor(self) -> tuple[int, int]:
         """Rows and columns of the whole sensor."""
-        return self._connection.sensor.rows, self._connection.sensor.columns
+        return self._sensor.rows, self._sensor.columns
 
     @property
     def exposure(self) -> float | None:
@@ -202,7 +200,7 @@ class LiveCamera:
 
     @region.setter
     def region(self, region: Region) -> None:
-        whole = self._connection.sensor
+        whole = self._sensor
         if (
             min(region.row, region.column) < 0
             or min(region.rows, region.columns) < 1
@@ -229,7 +227,7 @@ class LiveCamera:
             raise InputError('Only a camera whose trigger is "Software" can be fired.')
         with self._lock:
             self._run()
-            self._connection.fire()
+            self._ask(self._connection.fire)
 
     def _within(
         self, name: str, value: float, limits: tuple[float, float] | None, unit: str = ""
@@ -246,12 +244,12 @@ class LiveCamera:
         with self._lock:
             older = self._settings.get(name)
             self._settings[name] = value
-            if self._lost_since is not None:
+            if self._gone:
                 return  # it is set when the camera is back
             streaming = self._streaming
             self._halt()
             try:
-                getattr(self._connection, f"set_{name}")(value)
+                self._ask(getattr(self._connection, f"set_{name}"), value)
                 self._read_back()
             except CameraLost:
                 raise  # the reader brings the camera back, with the new value
@@ -319,8 +317,10 @@ class LiveCamera:
                     now = time.monotonic()
                     if now - asked > _SILENCE + exposure:
                         asked = now
+                        self._lost_since = self._lost_since or now
                         if not self._connection.alive():
                             raise CameraLost(f"The camera {self.info} does not answer any more.")
+                        self._lost_since = None
                 if now - began > timeout + exposure:
                     raise InputError(self._why_none(before, timeout))
                 time.sleep(0.001)  # lets a thread in that waits to set the camera
@@ -328,13 +328,26 @@ class LiveCamera:
                 self._recover(loss)
                 began = asked = time.monotonic()
 
+    def _ask(self, call: Callable, *arguments: Any) -> None:
+        """Let the camera do something; a refusal of one that is gone means that it is gone."""
+        try:
+            call(*arguments)
+        except CameraLost:
+            raise
+        except InputError as error:
+            if self._connection.alive():
+                raise
+            raise CameraLost(f"The camera {self.info} does not answer any more.") from error
+
     def _run(self) -> None:
         """Let the camera send, if it does not yet."""
         if self._closed:
             raise InputError("The camera was closed; open it again.")
+        if self._gone:
+            raise CameraLost(f"The camera {self.info} is away.")
         if not self._streaming:
             self._last = None  # many cameras begin to count anew
-            self._connection.start()
+            self._ask(self._connection.start)
             self._streaming = True
 
     def _halt(self) -> None:
@@ -352,46 +365,38 @@ class LiveCamera:
             arrival.release()
 
     def _newest(self) -> Arrival | None:
-        """Wait a moment for a frame; of several, return the newest whole one, release the rest."""
+        """Wait a moment for a frame; of several, return the last whole one, release the rest."""
         newest, received = None, 0
         arrival = self._connection.receive(_SLICE)
         while arrival is not None:
             received += 1
-            late = self._count(arrival)
-            if not arrival.complete:
-                arrival.release()
-            elif late and newest is not None:
-                self._skip(arrival)
-            else:
+            self._count(arrival)
+            if arrival.complete:
                 if newest is not None:
                     self._skip(newest)
                 newest = arrival
+            else:
+                arrival.release()
             arrival = self._connection.receive(0.0)
         if newest is not None and received >= self._connection.buffers and self.trigger is None:
             self._skip(newest)  # all places were full: the camera has sent newer ones in vain
             return None
         return newest
 
-    def _count(self, arrival: Arrival) -> bool:
-        """Count a frame, and those that a gap before it tells of; tell whether it is late.
-
-        A frame that misses packets is held back for a while, and those after it overtake it.
-        """
+    def _count(self, arrival: Arrival) -> None:
+        """Count a frame that came, and those that the gap before it tells of."""
         self._lost_since = None
         self._statistics.incomplete += not arrival.complete
         last, number = self._last, arrival.number
-        if last is None or number is None:
-            self._last = number if last is None else last + 1
-            return False
-        step = number - last
-        if abs(step) > _WRAP // 2 and max(number, last) <= _WRAP:
-            step -= int(np.sign(step)) * _WRAP  # the count began anew between the two
-        if step <= 0:
-            self._statistics.lost -= step < 0  # it was missed too early
-            return True
-        self._statistics.lost += step - 1
+        if number is None:
+            self._last = None if last is None else last + 1
+            return
+        if last is not None:
+            step = number - last
+            if step < -_WRAP // 2 and last <= _WRAP + 1:  # the count began anew between the two
+                step += _WRAP
+            self._statistics.lost += max(step - 1, 0)
         self._last = number
-        return False
 
     def _skip(self, arrival: Arrival) -> None:
         self._statistics.skipped += 1
@@ -452,10 +457,9 @@ class LiveCamera:
         with self._lock:
             if self._closed:
                 raise loss
-            if self._lost_since is None:
-                self._lost_since = time.monotonic()
-                self._report(f"{loss} Looking for it for {self._patience:g} s.")
-            since, self._streaming = self._lost_since, False
+            since = self._lost_since = self._lost_since or time.monotonic()
+            self._streaming, self._gone = False, True
+            self._report(f"{loss} Looking for it for {self._patience:g} s.")
             self._connection.close()
         why: InputError = loss
         while (waited := time.monotonic() - since) < self._patience and not self._closed:
@@ -475,6 +479,7 @@ class LiveCamera:
                 self._statistics.reconnected += 1
             self._report(f"The camera {self.info} is back after {waited:.1f} s.")
             return
+        self._lost_since = None  # whoever asks again lets it be looked for again
         raise CameraLost(
             f"The camera {self.info} was lost and did not come back within {self._patience:g} s; "
             f"see its cable and power. The last try said: {why}"

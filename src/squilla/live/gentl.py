@@ -145,8 +145,6 @@ class GentlConnection:
             self._nodes = self._acquirer.remote_device.node_map
             for automatic in ("ExposureAuto", "GainAuto"):
                 self._put(automatic, "Off", optional=True)
-            sides = (self._node(f"Sensor{side}", side) for side in ("Height", "Width"))
-            self.sensor = Region(*(int(node.value) for node in sides))
             self.formats = list(self._node("PixelFormat").symbolics)
             exposures = self._bounds(*_EXPOSURE)
             self.exposures = exposures and (exposures[0] / 1000, exposures[1] / 1000)
@@ -190,6 +188,12 @@ class GentlConnection:
             node.execute()
 
     # --- settings -----------------------------------------------------------------------------
+
+    @property
+    def sensor(self) -> Region:
+        # Where the sensor's own size is not told, the size of the first picture is all there is.
+        sides = (self._value(f"Sensor{side}", f"{side}Max", side) for side in ("Height", "Width"))
+        return Region(*(int(side or 0) for side in sides))
 
     def set_format(self, name: str) -> None:
         self._put("PixelFormat", name)
