@@ -87,7 +87,7 @@ def test_too_few_bytes_are_refused():
 def test_the_deepest_and_shortest_is_taken():
     assert best_format(["Mono8", "Mono16", "Mono12p", "Mono12"]).name == "Mono12p"
     assert best_format(["Mono8", "RGB8"]).name == "Mono8"
-    with pytest.raises(InputError, match="BayerRG12, RGB8.*colour camera"):
+    with pytest.raises(InputError, match=r"BayerRG12, RGB8.*colour camera"):
         best_format(["BayerRG12", "RGB8"])
     with pytest.raises(InputError, match="'RGB8' cannot be used: squilla reads Mono12p"):
         pixel_format("RGB8")

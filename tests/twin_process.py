@@ -24,12 +24,12 @@ def serve(ready, rate: float) -> None:
 
 
 def start(rate: float = 20.0):
-    """Return a process that is a camera and answers already."""
+    """Return a process that is a camera and answers already, and the pipe that it lives by."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["squilla.live.twin_camera", "numba"])
     ours, theirs = context.Pipe()
     process = context.Process(target=serve, args=(theirs, rate), daemon=True)
     process.start()
-    assert ours.poll(60) and ours.recv()
-    process.pipe = ours  # it ends when this is closed
-    return process
+    assert ours.poll(60)
+    assert ours.recv()
+    return process, ours

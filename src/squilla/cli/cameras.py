@@ -1,4 +1,4 @@
-"""``squilla cameras``, ``grab`` and ``twin-camera``: live cameras, and one that needs no hardware."""
+"""``squilla cameras``, ``grab`` and ``twin-camera``: live cameras, one of them without hardware."""
 
 import json
 import sys

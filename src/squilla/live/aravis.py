@@ -24,7 +24,7 @@ _SONAMES = ("libaravis-0.8.so.0", "libaravis-0.10.so.0")
 
 _SOCKET_BUFFER = 16 << 20
 """Bytes that the system is asked to hold between camera and library; it grants net.core.rmem_max.
-The library's own choice, one frame, loses packets whenever the reading thread waits for its turn."""
+The library's own choice, one frame, loses packets whenever its thread has to wait for its turn."""
 
 _COMPLETE = 0  # ArvBufferStatus
 _GONE = (2, 4, 5)  # ArvDeviceError: not connected, transfer error, time-out
@@ -316,9 +316,9 @@ class AravisConnection:
         if self._network:
             set_property(self._stream, "socket-buffer", 0)  # of fixed size
             set_property(self._stream, "socket-buffer-size", _SOCKET_BUFFER)
-        size = lib.arv_camera_get_payload(camera)
+        self._payload = lib.arv_camera_get_payload(camera)
         for _ in range(self.buffers):
-            lib.arv_stream_push_buffer(self._stream, lib.arv_buffer_new(size, None))
+            lib.arv_stream_push_buffer(self._stream, lib.arv_buffer_new(self._payload, None))
         lib.arv_camera_set_acquisition_mode(camera, 0)  # continuous
         lib.arv_camera_start_acquisition(camera)
 
@@ -341,9 +341,9 @@ class AravisConnection:
                 getattr(lib, f"arv_buffer_get_image_{side}")(buffer) for side in ("height", "width")
             )
             code = lib.arv_buffer_get_image_pixel_format(buffer)
-            size = c_size_t()
-            start = lib.arv_buffer_get_data(buffer, byref(size))
-            data = np.frombuffer((ctypes.c_uint8 * size.value).from_address(start), np.uint8)
+            start = lib.arv_buffer_get_data(buffer, byref(c_size_t()))  # its size is not kept up
+            held = (ctypes.c_uint8 * self._payload).from_address(start)
+            data = np.ctypeslib.as_array(held)
         return Arrival(
             complete=complete,
             number=number,

@@ -68,8 +68,9 @@ class Arrival:
 class Connection(Protocol):
     """An open camera. Every call returns within seconds, whatever the camera does.
 
-    Each may raise `CameraLost`. `buffers` frames may wait to be received. Exposures are in ms, gain in the camera's own unit, mostly dB;
-    both are None at a camera without. Settings change only while the camera stands still.
+    Each may raise `CameraLost`. `buffers` frames may wait to be received. Exposures are in ms, gain
+    in the camera's own unit, mostly dB; both are None at a camera without. Settings change only
+    while the camera stands still.
     """
 
     info: CameraInfo

@@ -1,9 +1,9 @@
 """Live cameras: open one, set it, and take its frames, the newest first, for as long as it takes.
 
-    with open_camera("genicam:Vendor-12345") as camera:
-        camera.exposure = 20.0
-        for raw in camera.frames():
-            ...
+with open_camera("genicam:Vendor-12345") as camera:
+    camera.exposure = 20.0
+    for raw in camera.frames():
+        ...
 """
 
 import threading
@@ -21,7 +21,7 @@ _SLICE = 0.05
 """Seconds of one wait: after each, an interrupt is heard and another thread may set the camera."""
 
 _SILENCE = 0.5
-"""Seconds without a frame, beyond the exposure, after which the camera is asked whether it lives."""
+"""Seconds of silence, beyond the exposure, after which the camera is asked whether it lives."""
 
 _SETTLING = 0.02
 """Seconds without a frame after which a stopped camera is taken to have sent its last."""

@@ -49,7 +49,7 @@ def cameras() -> list[CameraInfo]:
 def _harvester() -> Any:
     """Load all producers and let them look for cameras."""
     try:
-        from harvesters.core import Harvester
+        from harvesters.core import Harvester  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise InputError(
             "Vendors' GenTL producers need the Python package harvesters: "
@@ -81,10 +81,17 @@ def _info(device: Any) -> CameraInfo:
     )
 
 
+def _genicam() -> tuple[Any, Any]:
+    """Return the modules of features and of transport that harvesters stands on."""
+    from genicam import genapi, gentl  # pyright: ignore  # no types, and not always installed
+
+    return genapi, gentl
+
+
 @contextmanager
 def _refusals(what: str) -> Iterator[None]:
     """Turn what GenTL and GenApi raise into one sentence; what says that nobody is there, lost."""
-    from genicam import genapi, gentl
+    genapi, gentl = _genicam()
 
     gone = (gentl.IoException, gentl.InvalidHandleException, gentl.TimeoutException)
     try:
@@ -118,7 +125,7 @@ class GentlConnection:
     buffers = 6
 
     def __init__(self, name: str):
-        self._acquirer = None
+        self._acquirer: Any = None
         self._harvester = _harvester()
         try:
             self._open(name)
@@ -154,9 +161,8 @@ class GentlConnection:
 
     def _node(self, *names: str, writable: bool = False) -> Any:
         """Return the first of these features that the camera has now, else None."""
-        from genicam.genapi import EAccessMode
-
-        modes = {EAccessMode.WO, EAccessMode.RW} | (set() if writable else {EAccessMode.RO})
+        access = _genicam()[0].EAccessMode
+        modes = {access.WO, access.RW} | (set() if writable else {access.RO})
         nodes = (self._nodes.get_node(name) for name in names if self._nodes.has_node(name))
         return next((node for node in nodes if node.get_access_mode() in modes), None)
 
@@ -171,8 +177,7 @@ class GentlConnection:
 
     def _put(self, name: str, value: Any, *others: str, optional: bool = False) -> None:
         """Set the first feature of these names, a whole number where it must be one."""
-        from genicam import genapi
-
+        genapi, _ = _genicam()
         with _refusals(self._what):
             node = self._node(name, *others, writable=True)
             if node is not None:
@@ -257,13 +262,15 @@ class GentlConnection:
             if buffer is None:
                 return None
             code, region = self._sent
+            shape = _told(buffer, "height", region.rows), _told(buffer, "width", region.columns)
+            start = _told(buffer, "image_offset", 0)
             return Arrival(
                 complete=True,
                 number=_told(buffer, "frame_id", None),
                 timestamp=_told(buffer, "timestamp_ns", 0),
                 code=_told(buffer, "pixel_format", code),
-                shape=(_told(buffer, "height", region.rows), _told(buffer, "width", region.columns)),
-                data=np.frombuffer(buffer.raw_buffer, np.uint8, offset=_told(buffer, "image_offset", 0)),
+                shape=shape,
+                data=np.frombuffer(buffer.raw_buffer, np.uint8, offset=start),
                 release=lambda: buffer.parent.queue_buffer(buffer),
             )
 
@@ -280,9 +287,8 @@ class GentlConnection:
 
 def _told(of: Any, name: str, otherwise: Any) -> Any:
     """Return what a producer tells of a thing; what it does not know it refuses to tell."""
-    from genicam.gentl import GenericException
-
+    _, gentl = _genicam()
     try:
         return getattr(of, name)
-    except GenericException:
+    except gentl.GenericException:
         return otherwise

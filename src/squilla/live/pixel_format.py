@@ -157,7 +157,8 @@ def _encode_12_packed(pixels, data):
 @numba.njit(cache=True, nogil=True)
 def _decode_10p(data, pixels):
     for group in range(len(pixels) // 4):
-        a, b, c, d, e = data[5 * group : 5 * group + 5]
+        at = 5 * group
+        a, b, c, d, e = data[at], data[at + 1], data[at + 2], data[at + 3], data[at + 4]
         pixels[4 * group] = a | (b & 0x3) << 8
         pixels[4 * group + 1] = b >> 2 | (c & 0xF) << 6
         pixels[4 * group + 2] = c >> 4 | (d & 0x3F) << 4
@@ -167,7 +168,8 @@ def _decode_10p(data, pixels):
 @numba.njit(cache=True, nogil=True)
 def _encode_10p(pixels, data):
     for group in range(len(pixels) // 4):
-        a, b, c, d = pixels[4 * group : 4 * group + 4]
+        at = 4 * group
+        a, b, c, d = pixels[at], pixels[at + 1], pixels[at + 2], pixels[at + 3]
         data[5 * group] = a & 0xFF
         data[5 * group + 1] = a >> 8 | (b & 0x3F) << 2
         data[5 * group + 2] = b >> 6 | (c & 0xF) << 4

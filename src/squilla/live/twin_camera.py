@@ -67,6 +67,10 @@ class Simulation:
         Frames handed out so far.
     failure : Exception or None
         Why the last frame could not be made.
+
+    Notes
+    -----
+    It must live as long as the simulated camera, whose thread calls it.
     """
 
     def __init__(self, camera: int, frames: TwinFrames, rate: float):
@@ -110,16 +114,12 @@ class Simulation:
             frame >>= max(0, self._frames.design.sensor.bits - known.bits)
             start = self._lib.arv_buffer_get_data(buffer, byref(c_size_t()))
             place = (ctypes.c_uint8 * known.bytes_for(frame.size)).from_address(start)
-            known.pack(frame, np.frombuffer(place, np.uint8))
+            known.pack(frame, np.ctypeslib.as_array(place))
             period = max(self._register(_PERIOD_WANTED), exposure)
             self._lib.arv_fake_camera_write_register(self._camera, _PERIOD, period)
             self.sent += 1
         except Exception as error:  # the library cannot pass it on: whoever runs the camera will
             self.failure = error
-
-    def stop(self) -> None:
-        """Give the simulated camera its own test picture back."""
-        self._lib.arv_fake_camera_set_fill_pattern(self._camera, _FILL(), None, None)
 
 
 class TwinCamera:
