@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from squilla import __version__
-from squilla.cli import camera, filters, steps
+from squilla.cli import camera, cameras, filters, steps
 from squilla.cli.train import train
 from squilla.cli.view import live, view
 
@@ -27,6 +27,9 @@ app.command()(steps.reconstruct)
 app.command()(steps.evaluate)
 app.command()(view)
 app.command()(live)
+app.command()(cameras.cameras)
+app.command()(cameras.grab)
+app.command(name="twin-camera")(cameras.twin_camera)
 app.command()(camera.models)
 
 

@@ -1,0 +1,166 @@
+"""Time the way from a live camera to numbers: unpacking, the twin's frames, and both together.
+
+    python benchmarks/camera.py [-o experiments/results/camera.json]
+
+Unpacking stands beside NumPy. Frames of 12 megapixels go from the twin to a client in another
+process over 127.0.0.1, and within one process through the simulated device of libaravis. Times are
+medians after warm-up; the load of the machine is printed, for others may be at work on it.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import platform
+import time
+from dataclasses import asdict
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from squilla.camera.twin import Camera
+from squilla.live import aravis, twin_camera
+from squilla.live.connection import Region
+from squilla.live.genicam import LiveCamera, open_camera
+from squilla.live.pixel_format import FORMATS
+from squilla.live.twin_camera import Simulation, TwinCamera, description
+from squilla.live.twin_frames import TwinFrames
+
+SHAPE = (3000, 4000)
+SECONDS = 8.0
+
+
+def milliseconds(call, repeats: int = 15) -> float:
+    """Return the median time of a call after one to warm up."""
+    call()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        times.append(1000 * (time.perf_counter() - start))
+    return median(times)
+
+
+def by_numpy(data: np.ndarray) -> np.ndarray:
+    """Unpack Mono12p as one would in NumPy."""
+    triple = data.reshape(-1, 3).astype(np.uint16)
+    pixels = np.empty((len(triple), 2), np.uint16)
+    pixels[:, 0] = triple[:, 0] | (triple[:, 1] & 0xF) << 8
+    pixels[:, 1] = triple[:, 1] >> 4 | triple[:, 2] << 4
+    return pixels.reshape(SHAPE)
+
+
+def unpacking() -> dict[str, float]:
+    data = np.random.default_rng(0).integers(0, 256, 24_000_000, dtype=np.uint8)
+    times = {}
+    for name, known in FORMATS.items():
+        part = data[: known.bytes_for(SHAPE[0] * SHAPE[1])]
+        times[name] = milliseconds(lambda known=known, part=part: known.unpack(part, SHAPE))
+    part = data[:18_000_000]
+    assert np.array_equal(by_numpy(part), FORMATS["Mono12p"].unpack(part, SHAPE))
+    times["Mono12p by NumPy"] = milliseconds(lambda: by_numpy(part))
+    pixels = np.empty(SHAPE, np.uint16)
+    times["a copy of 24 MB into new memory"] = milliseconds(pixels.copy)
+    return times
+
+
+def frames_of(camera: Camera) -> TwinFrames:
+    ramp = np.linspace(5, 100, SHAPE[1], dtype=np.float32)
+    return TwinFrames(camera, [np.tile(ramp, (SHAPE[0], 1))])
+
+
+def drawing(frames: TwinFrames) -> dict[str, float]:
+    camera = Camera("thesis")
+    rate = frames.means[0]
+    return {
+        "frame of the twin camera": milliseconds(lambda: frames.draw(1, 10.0), 7),
+        "frame by ImageSensor.expose": milliseconds(lambda: camera.sensor.expose(rate, 10.0), 5),
+    }
+
+
+def serve(pipe, rate: float) -> None:
+    with TwinCamera(frames_of(Camera("thesis")), rate=rate) as twin:
+        pipe.send(True)
+        pipe.recv()
+        pipe.send(twin.sent)
+
+
+def watch(camera: LiveCamera) -> dict[str, float]:
+    """Read for some seconds; return the rate and what became of the frames."""
+    for _ in range(3):
+        camera.read(timeout=30)
+    before, start = camera.statistics.delivered, time.perf_counter()
+    while time.perf_counter() - start < SECONDS:
+        camera.read(timeout=30)
+    counts = camera.statistics
+    rate = (counts.delivered - before) / (time.perf_counter() - start)
+    return {"frames_per_s": rate, **asdict(counts)}
+
+
+def over_loopback(name: str, rate: float) -> dict[str, float]:
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.Process(target=serve, args=(theirs, rate))
+    process.start()
+    ours.recv()
+    with open_camera("genicam:127.0.0.1", pixel_format=name) as camera:
+        camera.exposure = 1.0
+        seen = watch(camera)
+    ours.send(None)
+    seen["sent"] = ours.recv()
+    process.join()
+    return seen
+
+
+def in_process(frames: TwinFrames) -> dict[str, float]:
+    aravis.library().arv_enable_interface(b"Fake")
+    path = str(description()).encode()
+    functions = aravis.bind({
+        "arv_set_fake_camera_genicam_filename": (None, twin_camera.c_char_p),
+        "arv_fake_device_get_fake_camera": (twin_camera.pointer, twin_camera.pointer),
+    })  # fmt: skip
+    functions["arv_set_fake_camera_genicam_filename"](path)
+    connection = aravis.AravisConnection("Fake_1")
+    inner = functions["arv_fake_device_get_fake_camera"](connection._device)
+    simulation = Simulation(inner, frames, 100.0)
+    with LiveCamera(lambda: connection, "Mono12p", 0.0, None) as camera:
+        camera.region, camera.exposure = Region(*SHAPE), 1.0
+        seen = watch(camera)
+    assert simulation.failure is None  # it lives as long as the camera sends
+    return seen
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--output", type=Path)
+    output = parser.parse_args().output
+    frames = frames_of(Camera("thesis"))
+    results = {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "threads": os.environ.get("NUMBA_NUM_THREADS", "default"),
+        "load_before": os.getloadavg()[0],
+        "milliseconds": unpacking() | drawing(frames),
+        "live": {
+            "loopback Mono12p": over_loopback("Mono12p", 100.0),
+            "loopback Mono12": over_loopback("Mono12", 100.0),
+            "in process Mono12p": in_process(frames),
+        },
+        "load_after": os.getloadavg()[0],
+    }
+    print(f"{results['machine']}; load {results['load_before']:.1f}, {results['load_after']:.1f}")
+    print("\n| 4000 x 3000 px | ms | megapixels/s |\n|---|---|---|")
+    for name, value in results["milliseconds"].items():
+        print(f"| {name} | {value:.1f} | {12000 / value:.0f} |")
+    print("\n| camera to reader | frames/s | delivered | skipped | incomplete | lost |")
+    print("|---|---|---|---|---|---|")
+    for name, seen in results["live"].items():
+        counts = " | ".join(
+            str(seen[key]) for key in ("delivered", "skipped", "incomplete", "lost")
+        )
+        print(f"| {name} | {seen['frames_per_s']:.1f} | {counts} |")
+    if output is not None:
+        output.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
