@@ -1,0 +1,165 @@
+"""What the thesis' experiments share: its camera, its captures, its networks, and their judge.
+
+The twin takes the calibration frames and one exposure of each scene; everything that is trained or
+reconstructed knows only those frames. Captures and calibration are made once, with fixed seeds, and
+kept in experiments/work, which may be deleted at any time.
+"""
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import squilla
+from squilla.calibration.calibration import Calibration
+from squilla.calibration.rehearsal import Rehearsal
+from squilla.camera.scenes import chart_layout, load_scene
+from squilla.evaluation.chart import COLOURS, inner
+from squilla.evaluation.metrics import evaluate, mse
+from squilla.files.disk import replacing
+from squilla.reconstruction.linear import complete
+
+HERE = Path(__file__).parent
+WORK = HERE / "work"
+RESULTS = HERE / "results"
+SNR = 20.0
+"""Of every capture, dB: what the thesis found for its camera."""
+
+PIXELS = 100
+"""Taken at random from the inside of every patch to judge by."""
+
+BANDS = (500, 550, 600, 650, 700, 750)
+"""Of the thesis' pictures, nm."""
+
+NETWORKS = {
+    "mlp": "BEST MLP (1.1M)",
+    "cnn": "CNN (1M)",
+    "rescnn": "ResCNN (3.5M)",
+    "unet": "U-Net (18.5M)",
+    "respecnn": "ReSpecNN (4M)",
+}
+"""Each with its name in the thesis' tables."""
+
+
+def camera() -> Calibration:
+    """Return the calibration of the thesis' camera, learnt from the twin's frames."""
+    path = WORK / "camera.nc"
+    if not path.exists():
+        WORK.mkdir(exist_ok=True)
+        rehearsal = Rehearsal(squilla.Camera("thesis"), step=5.0, bandwidth=5.0)
+        learnt = squilla.calibrate(
+            rehearsal.camera.design,
+            dark=rehearsal.dark(),
+            flat=rehearsal.flat(),
+            sweep=rehearsal.sweep(),
+            target=rehearsal.target(),
+            target_distance=rehearsal.distance,
+        )
+        learnt.save(path)
+    return squilla.load_calibration(path)
+
+
+def one_matrix(calibration: Calibration) -> Calibration:
+    """Return the calibration as the thesis has it: one sensitivity for the whole field."""
+    return Calibration.from_sensitivity(
+        calibration.mean_sensitivity.double().numpy(), calibration.wavelength
+    )
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One exposure of a scene, aligned, with the truth.
+
+    y : (H, W, M), DN per ms.  truth : (H, W, K), photon radiance.
+    """
+
+    y: Tensor
+    truth: np.ndarray
+
+    def patches(self) -> tuple[Tensor, np.ndarray]:
+        """Return measurement and truth of some pixels of each patch, (24, PIXELS, M or K)."""
+        random = np.random.default_rng(0)
+        inside = inner(chart_layout(*self.truth.shape[:2])).ravel()
+        pick = np.stack(
+            [random.choice(np.flatnonzero(inside == patch), PIXELS, False) for patch in range(24)]
+        )
+        return self.y.flatten(0, 1)[pick], self.truth.reshape(-1, self.truth.shape[-1])[pick]
+
+
+def capture(scene: str = "chart") -> Capture:
+    """Return a scene 300 mm away, captured at 20 dB, measured by the calibrated camera."""
+    path = WORK / f"{scene}.npz"
+    if not path.exists():
+        calibration, twin = camera(), squilla.Camera("thesis")
+        picture = load_scene(scene, twin.design.wavelength, twin.design.field.size)
+        generator = torch.Generator().manual_seed(0)
+        raw = twin.capture(picture, distance=300.0, snr=SNR, generator=generator)
+        seen = squilla.measure(raw, calibration)
+        y = complete(seen.y, seen.valid, calibration, seen.angle, seen.snr)
+        truth = twin.truth(picture, distance=300.0).cube.values
+        with replacing(path) as temporary, open(temporary, "wb") as file:
+            np.savez(file, y=y.numpy(), truth=truth.astype(np.float32))
+    with np.load(path) as file:
+        return Capture(torch.from_numpy(file["y"]), file["truth"])
+
+
+@torch.inference_mode()
+def judge(model: squilla.Reconstructor, chart: Capture, device: str = "cpu") -> dict:
+    """Return the errors of a reconstructor on the chart, and some of its spectra.
+
+    Every error is a mean squared one over the first 18 patches, the true spectrum scaled to a
+    maximum of 1: `single` of single pixels, `patch` of the mean of a patch's reconstructions,
+    `averaged` of the reconstruction of a patch's mean measurement. In `shape` the estimate, too,
+    is scaled to a maximum of 1.
+    """
+    y, truth = chart.patches()
+    truth = truth.astype(np.float64)
+    found = model(y.to(device)).cpu().double().numpy()
+    pairs = {
+        "single": (found, truth),
+        "patch": (found.mean(1), truth.mean(1)),
+        "averaged": (model(y.mean(1).to(device)).cpu().double().numpy(), truth.mean(1)),
+    }
+    result: dict = {"mse": {}, "shape": {}}
+    for name, (estimate, true) in pairs.items():
+        estimate, true = estimate[:COLOURS], true[:COLOURS]
+        result["mse"][name] = evaluate(estimate, true)["mse"]
+        result["shape"][name] = float(mse(_scaled(estimate), _scaled(true)).mean())
+    peak = truth.mean(1).max(-1, keepdims=True)
+    result["patches"] = mse(found.mean(1) / peak, truth.mean(1) / peak).round(6).tolist()
+    result["spectra"] = (found.mean(1) / peak)[:COLOURS, ::5].round(3).tolist()
+    return result
+
+
+def _scaled(spectra: np.ndarray) -> np.ndarray:
+    return spectra / np.maximum(spectra.max(-1, keepdims=True), 1e-12)
+
+
+@torch.inference_mode()
+def picture(model: squilla.Reconstructor, seen: Capture, device: str = "cpu") -> np.ndarray:
+    """Return the six bands of the thesis' pictures, (H, W, 6)."""
+    nearest = [int(np.abs(model.wavelength - band).argmin()) for band in BANDS]
+    rows = [model(row.to(device))[..., nearest].cpu() for row in seen.y]
+    return torch.stack(rows).numpy()
+
+
+def machine(device: str) -> dict:
+    """Return on what a number was measured."""
+    if device == "cuda":
+        return {"device": torch.cuda.get_device_name()}
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return {
+        "device": f"cpu, {torch.get_num_threads()} of {len(names)} x {names[0]}",
+        "load": round(os.getloadavg()[0], 1),
+    }
+
+
+def write_json(path: Path, content: dict) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content) + "\n")
