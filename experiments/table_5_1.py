@@ -22,22 +22,57 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
-import torch
-from thesis import NETWORKS, RESULTS, WORK, camera, capture, judge, machine, one_matrix, picture
-from thesis import write_json as write
+from thesis import (
+    NETWORKS,
+    RESULTS,
+    WORK,
+    Capture,
+    camera,
+    capture,
+    embed,
+    judge,
+    keep_picture,
+    machine,
+    one_matrix,
+    picture,
+    table,
+    write_json,
+)
 
 import squilla
+from squilla.calibration.calibration import Calibration
 from squilla.cli.train import parse_noise
-from squilla.files.disk import replacing
 
 CELLS = RESULTS / "table_5_1"
 NOISES = ("none", "20", "15:20", "10:20", "15", "25", "30", "10:25", "15:25")
 """What most wants to be known comes first."""
 
+PRIORS = {"gaussian": "Gaussians alone, as the thesis", "broad": "Broad prior"}
+
 SOLVERS = {"ridge": "ridge", "sparse": "sparse recovery"}
+
+PUBLISHED = {
+    "none": {"cnn": 0.22742, "rescnn": 0.15252, "unet": 0.02924, "respecnn": 0.01532},
+    "15": {"cnn": 0.01867, "rescnn": 0.06079, "unet": 0.01776, "respecnn": 0.0096},
+    "20": {"cnn": 0.01284, "rescnn": 0.02989, "unet": 0.01427, "respecnn": 0.00994},
+    "25": {"cnn": 0.01875, "rescnn": 0.0341, "unet": 0.01493, "respecnn": 0.00878},
+    "30": {"cnn": 0.02517, "rescnn": 0.03482, "unet": 0.01343, "respecnn": 0.0117},
+    "10:20": {"cnn": 0.00904, "rescnn": 0.03396, "unet": 0.00823, "respecnn": 0.00685},
+    "10:25": {"cnn": 0.01138, "rescnn": 0.02897, "unet": 0.0073, "respecnn": 0.00878},
+    "15:20": {"cnn": 0.01505, "rescnn": 0.0327, "unet": 0.01373, "respecnn": 0.00658},
+    "15:25": {"cnn": 0.01158, "rescnn": 0.03242, "unet": 0.00983, "respecnn": 0.00733},
+}
+"""The thesis' table 5.1: real captures with its own camera, never mixed with ours."""
+
+PLACES = {"patch": "patch means", "single": "single pixels"}
+
+KINDS = {
+    "none": ("none",),
+    "fixed": ("15", "20", "25", "30"),
+    "uniform": ("10:20", "10:25", "15:20", "15:25"),
+}
 
 
 @dataclass(frozen=True)
@@ -84,6 +119,7 @@ def main() -> None:
                     run(cell, one, chart, options)
         for other in others:
             other.wait()
+    render()
 
 
 def wanted(options: argparse.Namespace) -> Iterator[Cell]:
@@ -107,7 +143,7 @@ def claimed(cell: Cell) -> Iterator[bool]:
         yield not (CELLS / f"{cell.name}.json").exists()
 
 
-def run(cell: Cell, calibration, chart, options: argparse.Namespace) -> None:
+def run(cell: Cell, calibration: Calibration, chart: Capture, options: argparse.Namespace) -> None:
     """Train, judge and keep one cell."""
     began = time.perf_counter()
     record = asdict(cell) | machine(options.device)
@@ -139,14 +175,131 @@ def run(cell: Cell, calibration, chart, options: argparse.Namespace) -> None:
         model.save(WORK / f"{cell.name}.safetensors", half=True)
         model.to(options.device)
     if options.pictures:
-        with replacing(WORK / f"{cell.name}.npz") as temporary, open(temporary, "wb") as file:
-            bands = picture(model, chart, options.device).astype(np.float16)
-            np.savez_compressed(file, bands=bands)
+        keep_picture(f"{cell.name}_chart", picture(model, chart, options.device))
     device = options.device if cell.noise else "cpu"
-    write(CELLS / f"{cell.name}.json", record | judge(model, chart, device))
+    write_json(CELLS / f"{cell.name}.json", record | judge(model, chart, device))
     if cell.noise:
         checkpoint.unlink(missing_ok=True)
     print(f"{cell.name}: {time.perf_counter() - began:.0f} s", flush=True)
+
+
+# --- the tables ---------------------------------------------------------------------------------
+
+
+def render() -> None:
+    """Write every table that the finished cells allow."""
+    cells = [json.loads(path.read_text()) for path in sorted(CELLS.glob("*.json"))]
+    trained = [cell for cell in cells if cell["noise"]]
+    recipes = sorted({(cell["prior"], cell["epochs"]) for cell in trained}, reverse=True)
+    parts = []
+    for prior, epochs in recipes:
+        some = [cell for cell in trained if (cell["prior"], cell["epochs"]) == (prior, epochs)]
+        parts.append(f"**{PRIORS[prior]}, {epochs} epochs**\n\n{recipe_table(some)}")
+    embed("table_5_1", "\n\n".join(parts))
+    embed("table_5_1_solvers", solver_table([cell for cell in cells if not cell["noise"]]))
+    embed("table_5_1_kinds", kinds_table(trained, recipes))
+    embed("table_5_1_priors", priors_table(trained))
+
+
+def errors(cells: list[dict], network: str, noise: str, place: str = "patch") -> list[float]:
+    """Return the errors of a network, one for each seed; `place` as in `judge`."""
+    chosen = [cell for cell in cells if (cell["model"], cell["noise"]) == (network, noise)]
+    return [cell["mse"][place] for cell in chosen]
+
+
+def shown(values: list[float]) -> str:
+    """Return the mean, and with several seeds their number and half their range."""
+    if not values:
+        return "–"
+    half = (max(values) - min(values)) / 2
+    spread = f" ± {half:.4f} ({len(values)})" if len(values) > 1 else ""
+    return f"{np.mean(values):.4f}{spread}"
+
+
+def recipe_table(cells: list[dict]) -> str:
+    """Return the tables of one prior and number of epochs, the published figures beside them."""
+    networks = [name for name in NETWORKS if any(cell["model"] == name for cell in cells)]
+    parts = []
+    for place, name in PLACES.items():
+        head = [f"{name}: noise (dB)"]
+        for network in networks:
+            head += [NETWORKS[network]] + ["*thesis*"] * (network in PUBLISHED["none"])
+        rows = []
+        for noise, published in PUBLISHED.items():
+            row = [noise.replace(":", "–")]
+            for network in networks:
+                row.append(shown(errors(cells, network, noise, place)))
+                row += [f"*{published[network]:.4f}*"] if network in published else []
+            rows.append(row)
+        parts.append(table(head, rows))
+    return "\n\n".join(parts)
+
+
+def solver_table(cells: list[dict]) -> str:
+    head = ["", "patch means", "single pixels", "of the mean measurement"]
+    places = ("patch", "single", "averaged")
+    return table(
+        head,
+        [[SOLVERS[cell["model"]], *(f"{cell['mse'][place]:.4f}" for place in places)]
+         for cell in cells],
+    )  # fmt: skip
+
+
+def kinds_table(cells: list[dict], recipes: list[tuple[str, int]]) -> str:
+    """Return the mean error of each kind of noise, over the settings that are finished."""
+    rows = []
+    for network in NETWORKS:
+        if network in PUBLISHED["none"]:
+            means = {
+                kind: [PUBLISHED[noise][network] for noise in noises]
+                for kind, noises in KINDS.items()
+            }
+            rows.append([NETWORKS[network], "*thesis, 500 epochs*", "", *_verdict(means)])
+        for prior, epochs in recipes:
+            some = [c for c in cells if (c["prior"], c["epochs"]) == (prior, epochs)]
+            for place, name in PLACES.items():
+                means = {
+                    kind: [
+                        float(np.mean(each))
+                        for each in (errors(some, network, noise, place) for noise in noises)
+                        if each
+                    ]
+                    for kind, noises in KINDS.items()
+                }
+                if all(means.values()):
+                    recipe = f"{prior}, {epochs} epochs"
+                    rows.append([NETWORKS[network], recipe, name, *_verdict(means)])
+    head = ["network", "recipe", "", "none", "fixed", "uniform", "fixed < none", "uniform < fixed"]
+    return table(head, rows)
+
+
+def _verdict(means: dict[str, list[float]]) -> list[str]:
+    none, fixed, uniform = (float(np.mean(values)) for values in means.values())
+    counts = [f" ({len(values)})" if len(values) > 1 else "" for values in means.values()]
+    numbers = [
+        f"{mean:.4f}{count}" for mean, count in zip((none, fixed, uniform), counts, strict=True)
+    ]
+    return [*numbers, "yes" if fixed < none else "no", "yes" if uniform < fixed else "no"]
+
+
+def priors_table(cells: list[dict]) -> str:
+    """Return the thesis' prior beside the broader one, wherever both are finished."""
+    rows = []
+    for network in NETWORKS:
+        for noise in PUBLISHED:
+            for epochs in sorted({cell["epochs"] for cell in cells}):
+                pair = [
+                    [c for c in cells if (c["prior"], c["epochs"]) == (prior, epochs)]
+                    for prior in ("gaussian", "broad")
+                ]
+                found = [
+                    shown(errors(some, network, noise, place)) for place in PLACES for some in pair
+                ]
+                if "–" not in found:
+                    rows.append([NETWORKS[network], noise.replace(":", "–"), str(epochs), *found])
+    head = ["network", "noise (dB)", "epochs", "patch means: Gaussians", "broad",
+            "single pixels: Gaussians", "broad"]  # fmt: skip
+    return table(head, rows)
 
 
 if __name__ == "__main__":

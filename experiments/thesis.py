@@ -7,6 +7,7 @@ kept in experiments/work, which may be deleted at any time.
 
 import json
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from squilla.reconstruction.linear import complete
 HERE = Path(__file__).parent
 WORK = HERE / "work"
 RESULTS = HERE / "results"
+PAGE = HERE.parent / "docs" / "thesis.md"
 SNR = 20.0
 """Of every capture, dB: what the thesis found for its camera."""
 
@@ -91,18 +93,28 @@ class Capture:
 
 
 def capture(scene: str = "chart") -> Capture:
-    """Return a scene 300 mm away, captured at 20 dB, measured by the calibrated camera."""
+    """Return a scene, captured at 20 dB, measured by the calibrated camera.
+
+    scene : "chart", 300 mm away, or "solid", the doll with depth, 200 mm away.
+    """
     path = WORK / f"{scene}.npz"
     if not path.exists():
         calibration, twin = camera(), squilla.Camera("thesis")
-        picture = load_scene(scene, twin.design.wavelength, twin.design.field.size)
+        wavelength, size = twin.design.wavelength, twin.design.field.size
+        if scene == "solid":
+            from squilla.camera.solid import solid_scene
+
+            picture, depth = solid_scene(wavelength, size, distance=200.0)
+            place = {"distance": 200.0, "depth": depth}
+        else:
+            picture, place = load_scene(scene, wavelength, size), {"distance": 300.0}
         generator = torch.Generator().manual_seed(0)
-        raw = twin.capture(picture, distance=300.0, snr=SNR, generator=generator)
+        raw = twin.capture(picture, snr=SNR, generator=generator, **place)
         seen = squilla.measure(raw, calibration)
         y = complete(seen.y, seen.valid, calibration, seen.angle, seen.snr)
-        truth = twin.truth(picture, distance=300.0).cube.values
+        truth = twin.truth(picture, **place).cube.values
         with replacing(path) as temporary, open(temporary, "wb") as file:
-            np.savez(file, y=y.numpy(), truth=truth.astype(np.float32))
+            np.savez_compressed(file, y=y.numpy(), truth=truth.astype(np.float32))
     with np.load(path) as file:
         return Capture(torch.from_numpy(file["y"]), file["truth"])
 
@@ -147,6 +159,12 @@ def picture(model: squilla.Reconstructor, seen: Capture, device: str = "cpu") ->
     return torch.stack(rows).numpy()
 
 
+def keep_picture(name: str, bands: np.ndarray) -> None:
+    """Write a picture to the work folder, for `experiments/figures.py`."""
+    with replacing(WORK / f"{name}.npz") as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, bands=bands.astype(np.float16))
+
+
 def machine(device: str) -> dict:
     """Return on what a number was measured."""
     if device == "cuda":
@@ -163,3 +181,19 @@ def write_json(path: Path, content: dict) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(content) + "\n")
+
+
+def embed(name: str, text: str) -> None:
+    """Write a table to results/NAME.md, and into the page of documentation where it is marked."""
+    (RESULTS / f"{name}.md").write_text(text + "\n")
+    page = PAGE.read_text()
+    begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->"
+    place = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
+    with replacing(PAGE) as temporary:
+        temporary.write_text(place.sub(lambda _: f"{begin}{text}\n{end}", page))
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

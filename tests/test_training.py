@@ -14,8 +14,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from random_camera import smooth_camera
 import squilla
+from random_camera import smooth_camera
 from squilla import CameraDesign, InputError
 from squilla.reconstruction.linear import Ridge
 from squilla.reconstruction.reconstructor import load_model

@@ -27,17 +27,17 @@ from squilla.training.processes import Processes, joined
 
 Precision = Literal["float32", "tf32", "bfloat16"]
 
-CHECKPOINT_EVERY = 10
-"""Epochs between two checkpoints, and between two looks at spectra."""
-
-PATIENCE = 60.0
-"""Seconds after which a checkpoint is written whatever the epoch."""
+CHECKPOINTING = 0.02
+"""Part of the time that may go into writing checkpoints."""
 
 VALIDATION = 1000
 """Spectra that the network never trains on, to judge it by after every epoch."""
 
 LOOKED_AT = 6
 """Spectra of those that are shown while it trains."""
+
+LOOK_EVERY = 10
+"""Epochs between two looks at them."""
 
 
 def train(
@@ -102,8 +102,8 @@ def train(
     log : path, optional
         Gets one line of JSON for each epoch.
     checkpoint : path, optional
-        Written every ten epochs, or every minute; if it exists, training goes on from there, to
-        the same result as if it had never stopped.
+        Written after the first epoch, then as often as takes 2 % of the time; if it exists,
+        training goes on from there, to the same result as if it had never stopped.
     look : callable, optional
         Called every ten epochs with the epoch, six spectra that the network never trained on,
         (6, K), and what it makes of them.
@@ -153,17 +153,18 @@ def train(
         if log is not None:
             with replacing(log) as temporary:
                 temporary.write_text("".join(json.dumps(entry) + "\n" for entry in run.history))
-        written = time.monotonic()
+        free = 0.0  # when the next checkpoint may be written
         for epoch in _shown(range(len(run.history), epochs), name, epochs, run, progress):
             run.epoch(epoch)
-            due = (epoch + 1) % CHECKPOINT_EVERY == 0 or epoch + 1 == epochs
+            last, now = epoch + 1 == epochs, time.monotonic()
             if log is not None:
                 with open(log, "a") as file:
                     file.write(json.dumps(run.history[-1]) + "\n")
-            if checkpoint is not None and (due or time.monotonic() - written > PATIENCE):
+            if checkpoint is not None and (last or now > free):
                 run.write(Path(checkpoint))
                 written = time.monotonic()
-            if look is not None and due:
+                free = written + (written - now) / CHECKPOINTING
+            if look is not None and (last or (epoch + 1) % LOOK_EVERY == 0):
                 look(epoch, *run.shown())
         return run.finished()
 
