@@ -277,7 +277,7 @@ class _Run:
         """Go on from a checkpoint of the same training."""
         try:
             # weights_only: nothing in the file is executed.
-            state = torch.load(path, map_location=self.device, weights_only=True)
+            state = torch.load(path, map_location="cpu", weights_only=True)
             identity = state["identity"]
         except Exception as error:  # torch raises whatever its reader stumbles over
             raise InputError(f"{path} is not a checkpoint of a training; remove it.") from error
