@@ -74,6 +74,15 @@ def test_shape_type_and_sign(model, y, pixels):
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("name", ["ridge", *NETWORKS])
+def test_everything_is_made_on_the_device_of_the_model(name, y):
+    """On the meta device any tensor that was made elsewhere is an error."""
+    away = untrained(name).to("meta")
+    x = away(y.to("meta"))
+    assert (x.device.type, x.shape) == ("meta", (24, 48))
+
+
+@torch.no_grad()
 def test_double_precision_and_numpy_are_welcome(model, y):
     torch.testing.assert_close(model(y.double()), model(y))
     torch.testing.assert_close(model(y.numpy()), model(y))

@@ -1,21 +1,28 @@
 """Training: the noise is what it says, nothing depends on interruptions, and networks learn."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import squilla
 from random_camera import smooth_camera
-from squilla import InputError
+from squilla import CameraDesign, InputError
 from squilla.reconstruction.linear import Ridge
 from squilla.reconstruction.reconstructor import load_model
 from squilla.spectra import broad_spectra, gaussian_mixtures
 from squilla.training.data import Samples
 from squilla.training.fit import train
-from squilla.training.noise import add_noise
+from squilla.training.noise import SensorNoise, add_gain_errors, add_noise, drop_channels
 
 CAMERA = smooth_camera(0, filters=12, bands=40, angles=3)
 SHORT = {"count": 60, "epochs": 25, "batch": 32, "progress": False}
@@ -24,6 +31,7 @@ SHORT = {"count": 60, "epochs": 25, "batch": 32, "progress": False}
 # --- noise ----------------------------------------------------------------------------------
 
 
+@settings(deadline=None)  # a busy machine is no failure
 @given(st.floats(0, 60), st.floats(1e-3, 1e6))
 def test_noise_has_the_stated_ratio(snr, scale):
     generator = torch.Generator().manual_seed(0)
@@ -48,6 +56,60 @@ def test_no_noise_and_senseless_noise():
     for senseless in (float("nan"), (20, 10), (0, float("inf"))):
         with pytest.raises(InputError, match="cannot be drawn"):
             add_noise(y, senseless)
+
+
+def test_a_sensors_noise_is_shot_read_and_rounding():
+    """Poisson, Gaussian and uniform variances add: e + r^2 + g^2 / 12."""
+    generator = torch.Generator().manual_seed(0)
+    for read, gain in ((0.0, 0.01), (3.0, 0.01), (0.5, 6.0)):
+        sensor = SensorNoise(10_000, read, gain, exposure=(0.1, 0.1))
+        y = torch.tensor([1.0, 0.5, 0.02]).expand(50_000, 3).double()
+        seen = 1000 * add_noise(y, sensor, generator)  # electrons
+        electrons = 1000 * y[0]
+        torch.testing.assert_close(seen.mean(0), electrons, rtol=5e-3, atol=0.1)
+        expected = electrons + read**2 + gain**2 / 12
+        torch.testing.assert_close(seen.var(0), expected, rtol=0.04, atol=0)
+        steps = seen / gain
+        assert (steps - steps.round()).abs().max() < 1e-6
+
+
+def test_a_sensor_is_exposed_evenly_in_the_logarithm():
+    generator = torch.Generator().manual_seed(0)
+    sensor = SensorNoise(1e6, 0.0, 1e-3, exposure=(0.01, 1.0))
+    y = torch.ones(2000, 400)
+    share = (add_noise(y, sensor, generator) - y).double().var(-1).reciprocal() / 1e6
+    np.testing.assert_allclose(np.sort(share.log10()), np.linspace(-2, 0, 2000), atol=0.12)
+
+
+def test_a_designs_sensor_and_its_unit_do_not_matter():
+    design = CameraDesign.load("thesis")
+    sensor = SensorNoise.of(design.sensor)
+    assert (sensor.full_well, sensor.read_noise) == (11_000, 2.5)
+    y = torch.rand(50, 36) + 0.1
+    first, second = (
+        add_noise(scale * y, sensor, torch.Generator().manual_seed(3)) / scale for scale in (1, 64)
+    )
+    torch.testing.assert_close(first, second)
+    with pytest.raises(InputError, match="parts between 0 and 1"):
+        SensorNoise(11_000, 2.5, 2.8, exposure=(0.0, 0.5))
+
+
+def test_gain_errors_are_factors_with_the_stated_deviation():
+    generator = torch.Generator().manual_seed(0)
+    y = 0.5 + torch.rand(5000, 40, generator=generator)
+    factor = (add_gain_errors(y, 0.05, generator) / y).double()
+    assert float(factor.mean()) == pytest.approx(1, abs=1e-3)
+    assert float(factor.std()) == pytest.approx(0.05, rel=0.01)
+    assert float(torch.corrcoef(factor.T).fill_diagonal_(0).abs().max()) < 0.07  # one for each
+
+
+@pytest.mark.parametrize(("channels", "share"), [(36, 0.1), (36, 0.5), (5, 0.5), (1, 0.5)])
+def test_channels_are_lost_as_often_as_stated_but_never_too_many(channels, share):
+    generator = torch.Generator().manual_seed(0)
+    kept = drop_channels(torch.ones(20_000, channels), share, generator)
+    assert int(kept.sum(-1).min()) >= (channels + 1) // 2
+    if share == 0.1:
+        assert float(kept.float().mean()) == pytest.approx(0.9, abs=0.002)
 
 
 # --- samples --------------------------------------------------------------------------------
@@ -83,6 +145,25 @@ def test_the_thesis_set_is_gaussian_mixtures():
     samples = Samples(CAMERA, "gaussian", 30, fresh=False, seed=2)
     other = gaussian_mixtures(30, CAMERA.wavelength, generator=samples._generator(0, 0))
     assert torch.equal(samples.draw(5), other)
+
+
+def test_lost_channels_are_filled_from_the_others():
+    whole, part = (Samples(CAMERA, count=400, noise=None, dropped=share) for share in (0, 0.2))
+    ((y, _, x),) = part.batches(0, 400)
+    ((_, angle, same),) = whole.batches(0, 400)
+    assert torch.equal(x, same)
+    expected = CAMERA.project(x, angle)
+    expected = expected / expected.amax(-1, keepdim=True)
+    off = (y - expected).abs()
+    assert y.isfinite().all()
+    assert 0.6 < float((off < 1e-6).float().mean()) < 0.85  # also where the maximum was lost
+    assert float(off.mean()) < 0.05
+
+
+def test_senseless_disturbances_are_refused():
+    for wrong in ({"gain_error": -0.1}, {"gain_error": 1.5}, {"dropped": 0.6}):
+        with pytest.raises(InputError, match="make no sense"):
+            Samples(CAMERA, **wrong)
 
 
 def test_unknown_priors_are_refused():
@@ -141,6 +222,36 @@ def test_checkpoints_of_other_trainings_are_refused(tmp_path):
         train("mlp", CAMERA, **SHORT, checkpoint=path)
 
 
+def test_half_precision_learns_the_same(tmp_path):
+    """bfloat16 has 8 bits: the loss after some epochs agrees to a few per cent."""
+    setting = {**SHORT, "count": 512, "epochs": 8, "learning_rate": 1e-3}
+    full, half = (
+        train("respecnn", CAMERA, **setting, precision=precision).provenance["validation"]
+        for precision in ("float32", "bfloat16")
+    )
+    assert half != full
+    assert half == pytest.approx(full, rel=0.05)
+
+
+def test_batches_in_pieces_have_the_gradient_of_the_whole(monkeypatch):
+    setting = SHORT | {"epochs": 3}
+    whole = train("cnn", CAMERA, **setting)
+    monkeypatch.setattr("squilla.reconstruction.networks.CNN.piece", 7)
+    for one, other in zip(
+        whole.parameters(), train("cnn", CAMERA, **setting).parameters(), strict=True
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+
+
+def test_spectra_are_shown_while_it_learns():
+    seen = []
+    train("mlp", CAMERA, **SHORT, look=lambda *shown: seen.append(shown))
+    assert [epoch for epoch, _, _ in seen] == [9, 19, 24]
+    assert all(truth.shape == found.shape == (6, 40) for _, truth, found in seen)
+    assert torch.equal(seen[0][1], seen[1][1])
+    assert not torch.equal(seen[0][2], seen[1][2])
+
+
 def test_seeds_decide_and_the_callers_random_numbers_stay():
     torch.manual_seed(11)
     before = torch.get_rng_state()
@@ -187,6 +298,8 @@ def test_senseless_settings_are_refused():
         train("mlp", CAMERA, epochs=0)
     with pytest.raises(InputError, match="no schedule"):
         train("mlp", CAMERA, schedule="linear")
+    with pytest.raises(InputError, match="no precision"):
+        train("mlp", CAMERA, precision="int4")
     for device in ("cuda:99", "abacus"):
         with pytest.raises(InputError, match="no device"):
             train("mlp", CAMERA, device=device)
@@ -203,6 +316,7 @@ def test_noise_as_it_is_typed():
     assert parse_noise("none") is None
     assert parse_noise("20") == 20
     assert parse_noise("15:20") == (15, 20)
+    assert parse_noise("thesis") == SensorNoise.of(CameraDesign.load("thesis").sensor)
     for wrong in ("loud", "15-20", "20:15", "1:2:3", "nan", ""):
         with pytest.raises(InputError, match="none, 20 or 15:20"):
             parse_noise(wrong)
@@ -222,3 +336,59 @@ def test_the_command_trains_and_tells(tmp_path):
     assert load_model(tmp_path / "model.safetensors", CAMERA).provenance["seed"] == 4
     result = CliRunner().invoke(app, [*words, str(tmp_path / "nowhere" / "model.safetensors")])
     assert isinstance(result.exception, InputError)
+
+
+@pytest.fixture
+def command(tmp_path):
+    """A training by the command line, and the environment of its process."""
+    CAMERA.save(tmp_path / "camera.nc")
+    source = str(Path(squilla.__file__).parent.parent)
+    words = ["train", "--calibration", str(tmp_path / "camera.nc"), "--noise", "15:20", "--model",
+             "respecnn", "--count", "256", "--batch", "64", "--epochs", "60", "-o"]  # fmt: skip
+    return words, os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": source}
+
+
+def weights(path):
+    return load_model(path, CAMERA).state_dict()
+
+
+MAIN = [sys.executable, "-c", "import sys; from squilla.cli import main; sys.exit(main())"]
+
+
+@pytest.mark.slow
+def test_a_killed_command_goes_on_to_the_same_bits(command, tmp_path):
+    words, environment = command
+    straight, broken = tmp_path / "straight.safetensors", tmp_path / "broken.safetensors"
+    subprocess.run([*MAIN, *words, straight], env=environment, check=True, timeout=300)
+    state, log = tmp_path / "state.checkpoint", tmp_path / "log.jsonl"
+    words = [*MAIN, *words, broken, "--checkpoint", state, "--log", log]
+    for least in (12, 33):  # killed between two checkpoints, twice
+        process = subprocess.Popen(words, env=environment)
+        deadline = time.monotonic() + 300
+        while not log.exists() or len(log.read_text().splitlines()) < least:
+            assert process.poll() is None, "it ended before it was killed"
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+        assert state.exists()
+        assert not broken.exists()
+    subprocess.run(words, env=environment, check=True, timeout=300)
+    expected, found = weights(straight), weights(broken)
+    assert all(torch.equal(expected[key], found[key]) for key in expected)
+    assert len(log.read_text().splitlines()) == 60
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one(command, tmp_path):
+    words, environment = command
+    words[words.index("--epochs") + 1] = "3"
+    alone, together = tmp_path / "alone.safetensors", tmp_path / "together.safetensors"
+    subprocess.run([*MAIN, *words, alone], env=environment, check=True, timeout=300)
+    script = tmp_path / "main.py"
+    script.write_text("import sys; from squilla.cli import main; sys.exit(main())")
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    subprocess.run([*launch, script, *words, together], env=environment, check=True, timeout=300)
+    expected, found = weights(alone), weights(together)
+    for key in expected:
+        torch.testing.assert_close(found[key], expected[key], rtol=1e-3, atol=1e-5)

@@ -210,6 +210,29 @@ def line_spectra(
     return scaled(_sum_of_lines(wavelength, centre, height, width))
 
 
+def within_tables(wavelength: np.ndarray) -> np.ndarray:
+    """Return wavelengths at which natural spectra can be drawn for a band.
+
+    They are the band's own where the measured tables (500-750 nm) cover it. Otherwise the band is
+    mapped onto the tables': a camera of 400-1000 nm meets natural spectra stretched to its band,
+    which are as varied and as smooth, if not its own.
+
+    Parameters
+    ----------
+    wavelength : array, (K,)
+        nm.
+
+    Returns
+    -------
+    array, (K,), nm
+    """
+    known, wavelength = reflectances().wavelength, np.asarray(wavelength, float)
+    if known[0] - 1e-6 <= wavelength[0] and wavelength[-1] <= known[-1] + 1e-6:
+        return wavelength
+    share = (wavelength - wavelength[0]) / max(np.ptp(wavelength), 1e-9)
+    return known[0] + share * np.ptp(known)
+
+
 def natural_spectra(
     count: int, wavelength: np.ndarray, *, generator: "Generator | None" = None
 ) -> "Tensor":
@@ -218,8 +241,7 @@ def natural_spectra(
     Two reflectances are mixed in a random proportion, half of the time with a white gloss; the
     evaluation light (`CHART_LIGHT`) is left out.
 
-    The tables cover 500-750 nm. A band that reaches beyond them is mapped onto theirs: a camera of
-    400-1000 nm meets natural spectra stretched to it, as varied and as smooth, if not its own.
+    A band that reaches beyond the measured tables gets them stretched; see `within_tables`.
 
     Returns
     -------
@@ -227,11 +249,7 @@ def natural_spectra(
     """
     import torch
 
-    known = reflectances().wavelength
-    wavelength = np.asarray(wavelength, float)
-    if wavelength[0] < known[0] - 1e-6 or wavelength[-1] > known[-1] + 1e-6:
-        share = (wavelength - wavelength[0]) / max(np.ptp(wavelength), 1e-9)
-        wavelength = known[0] + share * np.ptp(known)
+    wavelength = within_tables(wavelength)
     surface = torch.from_numpy(reflectances().on(wavelength)).float()
     keep = [name != CHART_LIGHT for name in lights().name]
     light = torch.from_numpy(lights().on(wavelength)[keep]).float()

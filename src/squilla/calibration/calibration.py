@@ -183,13 +183,13 @@ class Calibration:
         -------
         Tensor, (..., A), float32, non-negative, summing to 1
         """
-        node = torch.from_numpy(np.asarray(self.angle) ** 2).float()
+        node = torch.from_numpy(np.asarray(self.angle) ** 2).float().to(angle.device)
         if len(node) == 1:
-            return torch.ones(*angle.shape, 1)
+            return torch.ones(*angle.shape, 1, device=angle.device)
         square = angle.float().square().clamp(node[0], node[-1])
         right = torch.searchsorted(node, square.contiguous()).clamp(1, len(node) - 1)
         weight = (square - node[right - 1]) / (node[right] - node[right - 1])
-        weights = torch.zeros(*angle.shape, len(node))
+        weights = torch.zeros(*angle.shape, len(node), device=angle.device)
         weights.scatter_(-1, (right - 1)[..., None], (1 - weight)[..., None])
         return weights.scatter_(-1, right[..., None], weight[..., None])
 
@@ -207,10 +207,10 @@ class Calibration:
         Tensor, (..., M)
         """
         if angle is None or len(self.angle) == 1:
-            return cube @ self.mean_sensitivity.T
+            return cube @ self.mean_sensitivity.to(cube.device).T
         weights = self.angle_weights(angle)
-        total = torch.zeros(*cube.shape[:-1], self.filters)
-        for node, sensitivity in enumerate(self.sensitivities):
+        total = torch.zeros(*cube.shape[:-1], self.filters, device=cube.device)
+        for node, sensitivity in enumerate(self.sensitivities.to(cube.device)):
             total += weights[..., node, None] * (cube @ sensitivity.T)
         return total
 

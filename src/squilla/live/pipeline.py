@@ -2,7 +2,6 @@
 
 import threading
 import time
-import traceback
 from collections import deque
 from typing import Any
 

@@ -115,7 +115,7 @@ def complete(
     -------
     Tensor, (..., M); NaN where fewer than half of a pixel's channels are valid
     """
-    valid = torch.as_tensor(valid, dtype=torch.bool)
+    valid = torch.as_tensor(valid, dtype=torch.bool, device=y.device)
     if valid.shape != y.shape:
         raise InputError(
             f"The valid mask has the shape {tuple(valid.shape)}, the measurement "
@@ -130,15 +130,15 @@ def complete(
     response = calibration.sensitivities.double() if angle is not None else None
     if response is None:
         response = calibration.mean_sensitivity.double()[None]
-    covariance = (response @ second_moment(calibration) @ response.mT).float()
+    covariance = (response @ second_moment(calibration) @ response.mT).float().to(y.device)
     known = torch.where(valid, y, 0)[partial]
     noise = _noise_to_signal(None if snr is None else snr[partial], len(known), y.device)
-    weights = torch.ones(len(known), 1)
+    weights = torch.ones(len(known), 1, device=y.device)
     if angle is not None:
         weights = calibration.angle_weights(angle[partial])
     parts = [
         _fill(known[some], valid[partial][some], weights[some], noise[some], covariance)
-        for some in torch.arange(len(known)).split(2048)
+        for some in torch.arange(len(known), device=y.device).split(2048)
     ]
     filled[partial] = torch.cat(parts)
     return filled
@@ -148,7 +148,7 @@ def _fill(y: Tensor, valid: Tensor, weights: Tensor, noise: Tensor, covariance: 
     """Return y, (N, M), with invalid channels replaced by C_iv C_vv^-1 y_v."""
     signal = torch.einsum("na,amk->nmk", weights, covariance)
     power = noise * signal.diagonal(dim1=-2, dim2=-1).mean(-1)
-    one = torch.eye(y.shape[-1])
+    one = torch.eye(y.shape[-1], device=y.device)
     both = valid[:, :, None] & valid[:, None, :]
     # Rows of invalid channels become those of the identity: they decouple and stay zero.
     reduced = torch.where(both, signal + power[:, None, None] * one, one)

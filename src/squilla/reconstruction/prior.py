@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from squilla.reconstruction.linear import within_tables
-from squilla.spectra import resample
+from squilla.spectra import resample, within_tables
 
 STORED = "weights.prior_"
 """How the prior's tensors are named in a model file."""

@@ -59,7 +59,7 @@ class Reconstructor(nn.Module):
     universal: ClassVar[bool] = False
     """Whether its weights serve every camera, not only the one that they were trained for."""
     piece: ClassVar[int] = 2048
-    """Pixels worked on at once."""
+    """Pixels worked on at once by a processor, to stay in its cache."""
 
     def __init__(self, calibration: Calibration):
         super().__init__()
@@ -122,10 +122,11 @@ class Reconstructor(nn.Module):
         if y.numel() == 0:
             return y.new_zeros(*pixels, len(self.wavelength))
         y = y.reshape(-1, y.shape[-1])
+        piece = self.piece * (1 if y.device.type == "cpu" else 32)  # a GPU has to be filled
         parts = [
             self._piece(y[some], None if angle is None else angle.reshape(-1)[some],
                         None if snr is None else snr.reshape(-1)[some], scale)
-            for some in torch.arange(len(y), device=y.device).split(self.piece)
+            for some in torch.arange(len(y), device=y.device).split(piece)
         ]  # fmt: skip
         return torch.cat(parts).reshape(*pixels, len(self.wavelength))
 

@@ -4,7 +4,8 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,13 +22,22 @@ from squilla.reconstruction.reconstructor import (
     model_class,
 )
 from squilla.training.data import Samples
-from squilla.training.noise import Noise
+from squilla.training.noise import Noise, SensorNoise
+from squilla.training.processes import Processes, joined
 
-CHECKPOINT_EVERY = 10
-"""Epochs between two checkpoints."""
+Precision = Literal["float32", "tf32", "bfloat16"]
+
+CHECKPOINTING = 0.02
+"""Part of the time that may go into writing checkpoints."""
 
 VALIDATION = 1000
 """Spectra that the network never trains on, to judge it by after every epoch."""
+
+LOOKED_AT = 6
+"""Spectra of those that are shown while it trains."""
+
+LOOK_EVERY = 10
+"""Epochs between two looks at them."""
 
 
 def train(
@@ -35,6 +45,8 @@ def train(
     calibration: Calibration,
     *,
     noise: Noise = (15.0, 20.0),
+    gain_error: float = 0.0,
+    dropped: float = 0.0,
     spectra: str = "broad",
     count: int = 8000,
     fresh: bool = True,
@@ -44,11 +56,15 @@ def train(
     schedule: Literal["constant", "cosine"] = "constant",
     seed: int = 0,
     device: str | None = None,
+    precision: Precision = "float32",
     log: str | Path | None = None,
     checkpoint: str | Path | None = None,
+    look: Callable[[int, Tensor, Tensor], None] | None = None,
     progress: bool = True,
 ) -> Reconstructor:
     """Train a network for one camera: Adam on the mean squared error over the wavelengths.
+
+    Started by torchrun, the processes share every batch.
 
     Parameters
     ----------
@@ -59,9 +75,15 @@ def train(
         those from `device` on.
     calibration : Calibration
         With several field angles, every sample gets one at random.
-    noise : None, float or (float, float)
-        Signal-to-noise ratio of the training measurements, dB: none, fixed, or drawn uniformly
-        between two for every sample (the thesis' contribution).
+    noise : None, float, (float, float) or SensorNoise
+        Of the training measurements: none, a fixed signal-to-noise ratio in dB, one drawn
+        uniformly between two for every sample (the thesis' contribution), or a sensor's.
+    gain_error : float
+        Standard deviation of factors by which the sensitivity of each channel is wrong, new for
+        every sample: teaches a network not to trust R beyond what it was calibrated to.
+    dropped : float
+        Probability that a channel is lost and, as in `Reconstructor.reconstruct`, filled from the
+        others.
     spectra : str
         What to train on, a key of spectra.PRIORS: "broad" (default), or "gaussian" as the thesis.
     count : int
@@ -77,11 +99,17 @@ def train(
         weights to the bit, on one machine's CPU with one number of threads.
     device : str, optional
         "cpu", "cuda" or "cuda:1"; default: CUDA where there is one.
+    precision : "float32", "tf32" or "bfloat16"
+        Of the products in the network; weights, loss and optimiser stay in float32. bfloat16
+        trains convolutions three times as fast on processors that have it; tf32 is CUDA's.
     log : path, optional
         Gets one line of JSON for each epoch.
     checkpoint : path, optional
-        Written every ten epochs; if it exists, training goes on from there, to the same result
-        as if it had never stopped.
+        Written after the first epoch, then as often as takes 2 % of the time; if it exists,
+        training goes on from there, to the same result as if it had never stopped.
+    look : callable, optional
+        Called every ten epochs with the epoch, six spectra that the network never trained on,
+        (6, K), and what it makes of them.
     progress : bool
         Show a progress bar.
 
@@ -108,17 +136,20 @@ def train(
     if kind.universal:
         from squilla.training.compound import Recipe, train_compound
 
-        return train_compound(
-            calibration,
-            Recipe(steps=epochs * math.ceil(count / batch), seed=seed),
-            device=_device(device),
-            log=log,
-            checkpoint=checkpoint,
-            progress=progress,
-        )
-    samples = Samples(calibration, spectra, count, noise, fresh, seed)
+        with joined(device) as processes:
+            return train_compound(
+                calibration,
+                Recipe(steps=epochs * math.ceil(count / batch), seed=seed),
+                device=processes.device,
+                log=log,
+                checkpoint=checkpoint,
+                progress=progress,
+            )
+    samples = Samples(calibration, spectra, count, noise, gain_error, dropped, fresh, seed)
     settings = {
         "noise": _named(noise),
+        "gain_error": gain_error,
+        "dropped": dropped,
         "spectra": spectra if fresh else f"{spectra}, one set",
         "count": count,
         "epochs": epochs,
@@ -126,21 +157,31 @@ def train(
         "learning_rate": learning_rate,
         "schedule": schedule,
         "seed": seed,
+        "precision": precision,
     }
-    run = _Run(kind, samples, settings, _device(device))
-    if checkpoint is not None and Path(checkpoint).exists():
-        run.resume(Path(checkpoint))
-    if log is not None:
-        with replacing(log) as temporary:
-            temporary.write_text("".join(json.dumps(entry) + "\n" for entry in run.history))
-    for epoch in shown(range(len(run.history), epochs), name, run.history, progress):
-        run.epoch(epoch)
+    with joined(device) as processes, _products(precision):
+        run = _Run(kind, samples, settings, processes)
+        if checkpoint is not None and Path(checkpoint).exists():
+            run.resume(Path(checkpoint))
+        if processes.rank:  # the first process speaks and writes for all
+            log, checkpoint, look, progress = None, None, None, False
         if log is not None:
-            with open(log, "a") as file:
-                file.write(json.dumps(run.history[-1]) + "\n")
-        if checkpoint is not None and ((epoch + 1) % CHECKPOINT_EVERY == 0 or epoch + 1 == epochs):
-            run.write(Path(checkpoint))
-    return run.finished()
+            with replacing(log) as temporary:
+                temporary.write_text("".join(json.dumps(entry) + "\n" for entry in run.history))
+        free = 0.0  # when the next checkpoint may be written
+        for epoch in shown(range(len(run.history), epochs), name, run.history, progress):
+            run.epoch(epoch)
+            last, now = epoch + 1 == epochs, time.monotonic()
+            if log is not None:
+                with open(log, "a") as file:
+                    file.write(json.dumps(run.history[-1]) + "\n")
+            if checkpoint is not None and (last or now > free):
+                run.write(Path(checkpoint))
+                written = time.monotonic()
+                free = written + (written - now) / CHECKPOINTING
+            if look is not None and (last or (epoch + 1) % LOOK_EVERY == 0):
+                look(epoch, *run.shown())
+        return run.finished()
 
 
 class _Run:
@@ -151,19 +192,21 @@ class _Run:
         kind: type[Reconstructor],
         samples: Samples,
         settings: dict[str, Any],
-        device: torch.device,
+        processes: Processes,
     ):
         with torch.random.fork_rng(devices=[]):  # the caller's random numbers stay as they are
             torch.manual_seed(settings["seed"])
-            self.model = kind(samples.calibration).to(device)
+            self.model = kind(samples.calibration).to(processes.device)
         self.optimiser = torch.optim.Adam(self.model.parameters(), lr=settings["learning_rate"])
-        self.samples, self.settings, self.device = samples, settings, device
+        self.samples, self.settings, self.processes = samples, settings, processes
+        self.device = processes.device
+        # On the processor a batch goes through in pieces that stay in the cache: the same gradient,
+        # sooner. Batch normalisation needs the batch whole.
+        normed = any(isinstance(part, nn.BatchNorm1d) for part in self.model.modules())
+        self.piece = self.model.piece if self.device.type == "cpu" and not normed else None
         self.history: list[dict[str, float]] = []
         held_out = replace(samples, count=VALIDATION, seed=samples.seed + 2**32)
-        self.validation = [
-            tuple(part.to(device) for part in sample)
-            for sample in held_out.batches(0, self.model.piece)
-        ]
+        self.validation = list(held_out.batches(0, self.model.piece, self.device))
 
     def epoch(self, epoch: int) -> None:
         """Train for one epoch, judge the result, and note both."""
@@ -172,9 +215,10 @@ class _Run:
         steps = math.ceil(self.samples.count / size)
         total = torch.zeros((), device=self.device)
         self.model.train()
-        for step, sample in enumerate(self.samples.batches(epoch, size)):
+        for step, sample in enumerate(self.samples.batches(epoch, size, self.device)):
             rate = self._rate((epoch + step / steps) / epochs)
-            total += self._step(rate, *(part.to(self.device) for part in sample))
+            total += self._step(rate, *sample)
+        self.processes.sum([total])
         self.model.eval()
         entry = {
             "epoch": epoch,
@@ -188,14 +232,25 @@ class _Run:
         self.history.append(entry)
 
     def _step(self, rate: float, y: Tensor, angle: Tensor, x: Tensor) -> Tensor:
-        """Take one step down the mean squared error; return its sum over the samples."""
+        """Take one step down the mean squared error; return this process's sum over its samples."""
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.optimiser.zero_grad()
-        loss = nn.functional.mse_loss(self.model.estimate(y, angle), x)
-        loss.backward()
+        total, whole = torch.zeros((), device=self.device), len(x)
+        parts = self.processes.share(y, angle, x)
+        pieces = zip(*(part.split(self.piece or whole) for part in parts), strict=True)
+        for some_y, some_angle, some_x in pieces:
+            loss = (self._estimate(some_y, some_angle) - some_x).square().mean(-1).sum()
+            (loss / whole).backward()
+            total += loss.detach()
+        self.processes.sum(weight.grad for weight in self.model.parameters())
         self.optimiser.step()
-        return loss.detach() * len(x)
+        return total
+
+    def _estimate(self, y: Tensor, angle: Tensor) -> Tensor:
+        half = self.settings["precision"] == "bfloat16"
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=half):
+            return self.model.estimate(y, angle).float()
 
     def _rate(self, share: float) -> float:
         """Return the learning rate after this share of the training."""
@@ -207,10 +262,16 @@ class _Run:
     @torch.inference_mode()
     def _validate(self) -> float:
         total = sum(
-            float((self.model.estimate(y, angle) - x).square().mean()) * len(x)
+            float((self._estimate(y, angle) - x).square().mean()) * len(x)
             for y, angle, x in self.validation
         )
         return total / VALIDATION
+
+    @torch.inference_mode()
+    def shown(self) -> tuple[Tensor, Tensor]:
+        """Return some spectra never trained on, and what the network makes of them."""
+        y, angle, x = (part[:LOOKED_AT] for part in self.validation[0])
+        return x.cpu(), self._estimate(y, angle).cpu()
 
     def _identity(self) -> dict[str, Any]:
         camera = fingerprint(self.samples.calibration)
@@ -231,7 +292,7 @@ class _Run:
         """Go on from a checkpoint of the same training."""
         try:
             # weights_only: nothing in the file is executed.
-            state = torch.load(path, map_location=self.device, weights_only=True)
+            state = torch.load(path, map_location="cpu", weights_only=True)
             identity = state["identity"]
         except Exception as error:  # torch raises whatever its reader stumbles over
             raise InputError(f"{path} is not a checkpoint of a training; remove it.") from error
@@ -258,21 +319,30 @@ class _Run:
         return model
 
 
-def _device(name: str | None) -> torch.device:
-    if name is None:
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        return torch.empty(0, device=name).device
-    except (RuntimeError, AssertionError) as error:  # torch asserts that it was built with CUDA
-        raise InputError(f"There is no device {name!r} here; use cpu.") from error
-
-
 def _named(noise: Noise) -> str:
     if noise is None:
         return "none"
+    if isinstance(noise, SensorNoise):
+        return str(noise)
     if isinstance(noise, tuple):
         return f"{noise[0]:g}-{noise[1]:g} dB"
     return f"{noise:g} dB"
+
+
+@contextmanager
+def _products(precision: Precision) -> Iterator[None]:
+    """Let CUDA round the factors of float32 products as asked, and put its setting back."""
+    if precision not in ("float32", "tf32", "bfloat16"):
+        raise InputError(
+            f"There is no precision {precision!r}; there are float32, tf32 and bfloat16."
+        )
+    allowed, before = precision != "float32", torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if allowed else "highest")
+    try:
+        with torch.backends.cudnn.flags(enabled=True, benchmark=True, allow_tf32=allowed):
+            yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def shown(

@@ -14,8 +14,14 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional
 
-from squilla.reconstruction.linear import within_tables
-from squilla.spectra import CHART_LIGHT, gaussian_mixtures, lights, line_spectra, reflectances
+from squilla.spectra import (
+    CHART_LIGHT,
+    gaussian_mixtures,
+    lights,
+    line_spectra,
+    reflectances,
+    within_tables,
+)
 
 HELD_OUT = 8
 """Of so many reflectances and lamps one is kept for validation, never trained on."""
