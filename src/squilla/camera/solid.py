@@ -36,9 +36,9 @@ class Part:
 _SKIN = ("HyspexSkinReflectance22", "HyspexSkinReflectance58")
 _WALL = ("kaolini8.spc Kaolinite CM7", "goethit1.spc Goethite WS222")
 _DOLL = (
-    Part((0.28, -0.055), (0.22, 0.038), 0.05, (0.15, 0.35), ("p159", "p14"), "stripes", 0.022),
-    Part((0.28, 0.055), (0.22, 0.038), -0.05, (0.15, 0.35), ("p159", "p14"), "stripes", 0.022),
-    Part((-0.19, 0.0), (0.18, 0.16), 0.0, (0.25, 0.45), ("p86", "p46"), "hair", 0.01),
+    Part((0.28, -0.055), (0.22, 0.038), 0.05, (0.15, 0.35), ("p159", "p67"), "stripes", 0.022),
+    Part((0.28, 0.055), (0.22, 0.038), -0.05, (0.15, 0.35), ("p159", "p67"), "stripes", 0.022),
+    Part((-0.19, 0.0), (0.18, 0.16), 0.0, (0.25, 0.45), ("p46", "p73"), "hair", 0.01),
     Part((0.09, 0.0), (0.2, 0.135), 0.0, (0.4, 0.75), ("esserChart36", "p73"), "cloth", 0.01),
     Part((0.05, -0.19), (0.045, 0.15), -0.9, (0.3, 0.5), _SKIN, "grain", 0.007),
     Part((0.02, 0.19), (0.045, 0.15), 0.7, (0.55, 0.8), _SKIN, "grain", 0.007),
@@ -46,7 +46,7 @@ _DOLL = (
     Part((-0.22, -0.04), (0.013, 0.018), 0.0, (0.9, 0.95), ("p34", "p34"), "plain"),
     Part((-0.22, 0.04), (0.013, 0.018), 0.0, (0.9, 0.95), ("p34", "p34"), "plain"),
     Part((-0.15, 0.0), (0.01, 0.035), 0.0, (0.9, 0.95), ("esserChart5", "p73"), "plain"),
-    Part((-0.07, 0.3), (0.075, 0.075), 0.0, (0.6, 1.0), ("p28", "p40"), "dots", 0.028),
+    Part((-0.07, 0.3), (0.075, 0.075), 0.0, (0.6, 1.0), ("p28", "p14"), "dots", 0.028),
     Part((0.2, -0.33), (0.3, 0.012), 0.12, (0.8, 0.85), ("esserChart24", "p46"), "grain", 0.01),
     Part((0.33, 0.3), (0.09, 0.14), 0.3, (0.2, 0.5), ("p165", "p165"), "plain"),
 )
@@ -106,9 +106,11 @@ def solid_scene(
     height = 0.06 * (y + 0.5) + folds + np.clip(y - 0.4, 0, None) * 2.5
     mix = np.where(x < 0.1 * np.sin(9 * y), _pattern("cloth", 0.01, y, x, random), 0.0)
     surface = _mixed(_WALL, mix, wavelength)
+    shade = 0.9 - 0.6 * folds * np.sin(22 * x + 2 * y)
     for part in _DOLL:
         pose = random.normal(0, 0.006, 2)
         v, u = y - part.middle[0] - pose[0], x - part.middle[1] - pose[1]
+        lean = (v + u) / max(part.half)
         cosine, sine = np.cos(part.turn), np.sin(part.turn)
         v, u = v * cosine + u * sine, u * cosine - v * sine
         radius = (v / part.half[0]) ** 2 + (u / part.half[1]) ** 2
@@ -116,11 +118,11 @@ def solid_scene(
         own = rim + (top - rim) * np.sqrt(np.clip(1 - radius, 0, None))
         front = (radius < 1) & (own > height)
         mix = _pattern(part.pattern, part.size, v, u, random)
-        height = np.where(front, own, height)
-        surface[front] = _mixed(part.materials, mix, wavelength)[front]
+        height, shade = np.where(front, (own, 0.8 - 0.18 * lean), (height, shade))
+        surface[front] = _mixed(part.materials, mix[front], wavelength)
     depth = distance + relief * (0.5 - np.clip(height, 0, 1))
-    lamp = lights().on(wavelength)[lights().name.index(light)]
-    scene = surface * (lamp * _shade(height)[..., None]).astype(np.float32)
+    lamp = lights().on(wavelength)[lights().name.index(light)].astype(np.float32)
+    scene = surface * lamp * shade[..., None].astype(np.float32)
     return labelled(scene, wavelength, attributes={"name": "doll", "light": light}), depth
 
 
@@ -156,11 +158,3 @@ def _pattern(
         return np.clip(0.5 + np.sin(2 * np.pi * v / size) + 0.2 * noise, 0, 1)
     return np.clip(0.5 + 0.35 * noise, 0, 1)
 
-
-def _shade(height: np.ndarray) -> np.ndarray:
-    """Return how much light of a lamp at the upper left each sample gets, 0.55..1.
-
-    From a smoothed relief, so that a step does not glare.
-    """
-    steep_y, steep_x = np.gradient(gaussian_filter(height, len(height) / 80) * len(height) / 6)
-    return np.clip(0.85 - 0.3 * (steep_y + steep_x) / np.sqrt(1 + steep_y**2 + steep_x**2), 0.55, 1)
