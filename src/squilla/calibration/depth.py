@@ -1,180 +1,100 @@
-"""Depth for every pixel: planes swept through all sub-images at once."""
+"""Depth for every pixel: planes swept through all sub-images at once.
+
+The array is rigid, so the 35 disparities of a point are one number, its inverse depth, times the
+calibrated baselines. Planes of inverse depth are swept through the scene; at each the gradients of
+all sub-images are laid over each other. Where the plane is right they add up, where it is wrong they
+scatter; that needs no two filters to see the same brightness.
+"""
+
+from dataclasses import dataclass
 
 import numba
 import numpy as np
+from scipy import ndimage
+
+from squilla.calibration.alignment import SubImages, align
+from squilla.calibration.calibration import Lattice
+from squilla.calibration.disparity import gradients
+
+_STEP = 0.45
+"""Shift of the farthest unit from one plane to the next, px: a third of the features' width."""
+
+_SMOOTH = 1.2
+"""Standard deviation of the smoothing before the gradient, px."""
+
+_WINDOW = 1.0
+"""Standard deviation of the window over which evidence is gathered, px."""
+
+_HALF = 0.06
+"""What it costs to believe one half of the array alone, as a share of unexplained energy."""
+
+_SLANT, _JUMP = 0.05, 1.0
+"""Costs of a step by one plane and of a jump, in units of the typical spread of the evidence."""
 
 
-def features(image, noise, smooth=1.2):
-    from squilla.calibration.disparity import _derivative, _gradient
+@dataclass(frozen=True)
+class Depth:
+    """What the sweep found for every point of the reference view.
 
-    bell, slope = _derivative(smooth)
-    across, down = np.empty_like(image), np.empty_like(image)
-    _gradient(image, bell, slope, across, down)
-    sigma = np.sqrt(noise * (bell**2).sum() * (slope**2).sum()).astype(np.float32)[:, None, None]
-    gx, gy = across / sigma, down / sigma
-    return np.stack([gx, gy, gx**2 + gy**2], 1)
+    disparity : (H, W) float32, px per lens pitch.
+    deviation : (H, W) float32, expected standard deviation of it by the noise, px per lens pitch.
+    seen : (H, W, M) bool; False where something nearer hides the point from a unit.
+    """
 
-
-def double_angle(f):
-    size = np.sqrt(f[:, 2] + 2)
-    a, b = (f[:, 0] ** 2 - f[:, 1] ** 2) / size, 2 * f[:, 0] * f[:, 1] / size
-    return np.stack([a, b, a**2 + b**2], 1)
+    disparity: np.ndarray
+    deviation: np.ndarray
+    seen: np.ndarray
 
 
-def gaussian(sigma):
-    reach = int(np.ceil(2 * sigma))
-    tap = np.arange(-reach, reach + 1)
-    bell = np.exp(-(tap**2) / (2 * sigma**2))
-    return (bell / bell.sum()).astype(np.float32)
+def find_depth(
+    views: SubImages, lattice: Lattice, noise: np.ndarray, nearest: float, farthest: float = 0.0
+) -> Depth:
+    """Find the disparity of every point of the reference view.
 
+    Parameters
+    ----------
+    views : SubImages
+        With a margin that holds the shifts of the nearest plane.
+    lattice : Lattice
+    noise : array, (M,)
+        Variance of each sub-image's noise, DN^2.
+    nearest, farthest : float
+        Largest and smallest disparity looked for, px per lens pitch.
 
-@numba.njit(fastmath=True, cache=True, error_model="numpy")
-def _add(up, down, a, b, c, d, w, s):
-    for x in range(len(s)):
-        s[x] += w * (a * up[x] + b * up[x + 1] + c * down[x] + d * down[x + 1])
+    Returns
+    -------
+    Depth
 
-
-@numba.njit(fastmath=True, cache=True)
-def _smooth(field, bell, wide, out):
-    n = len(bell)
-    width = wide.shape[1]
-    for r in range(field.shape[0]):
-        wide[r] = 0
-        for k in range(n):
-            part = field[r, k : k + width]
-            for x in range(width):
-                wide[r, x] += bell[k] * part[x]
-    for r in range(out.shape[0]):
-        out[r] = 0
-        for k in range(n):
-            for x in range(width):
-                out[r, x] += bell[k] * wide[r + k, x]
-
-
-@numba.njit(parallel=True, fastmath=True, cache=True, error_model="numpy")
-def sweep(feature, weight, start, baseline, group, planes, bell, floor, half_cost, tile, cost, edge):
-    units = feature.shape[0]
-    height, width, count = cost.shape
-    reach = len(bell) // 2
-    power = np.zeros(5, np.float32)
-    for m in range(units):
-        for subset in range(5):
-            if _within(group[m], subset):
-                power[subset] += weight[m] ** 2
-    for block in numba.prange((height + tile - 1) // tile):
-        top = block * tile
-        bottom = min(top + tile, height)
-        first = top - reach
-        rows = bottom - top + 2 * reach
-        columns = width + 2 * reach
-        sums = np.empty((4, 3, rows, columns), np.float32)
-        field = np.empty((rows, columns), np.float32)
-        wide = np.empty((rows, width), np.float32)
-        shared = np.empty((bottom - top, width), np.float32)
-        whole = np.empty((bottom - top, width), np.float32)
-        best = np.full((bottom - top, width), np.float32(1e9))
-        for k in range(count):
-            sums[:] = 0
-            for m in range(units):
-                v = start[m, 0] + planes[k] * baseline[m, 0] + first
-                u = start[m, 1] + planes[k] * baseline[m, 1] - reach
-                i, j = int(np.floor(v)), int(np.floor(u))
-                fv, fu = np.float32(v - i), np.float32(u - j)
-                one = np.float32(1)
-                a, b = (one - fv) * (one - fu), (one - fv) * fu
-                c, d = fv * (one - fu), fv * fu
-                for channel in range(3):
-                    w = weight[m] if channel < 2 else one
-                    for r in range(rows):
-                        _add(
-                            feature[m, channel, i + r, j : j + columns + 1],
-                            feature[m, channel, i + r + 1, j : j + columns + 1],
-                            a, b, c, d, w, sums[group[m], channel, r],
-                        )
-            for subset in range(5):
-                for part in range(2):
-                    if part == 0:
-                        field[:] = 0
-                        for channel in range(2):
-                            for r in range(rows):
-                                for x in range(columns):
-                                    z = np.float32(0)
-                                    for q in range(4):
-                                        if _within(q, subset):
-                                            z += sums[q, channel, r, x]
-                                    field[r, x] += z * z
-                        _smooth(field, bell, wide, shared)
-                    else:
-                        field[:] = 0
-                        for q in range(4):
-                            if _within(q, subset):
-                                field += sums[q, 2]
-                        _smooth(field, bell, wide, whole)
-                members = np.float32(units if subset == 0 else units / 2)
-                for r in range(bottom - top):
-                    for x in range(width):
-                        e = shared[r, x] / power[subset]
-                        z = (whole[r, x] - e) / (whole[r, x] + floor * members)
-                        if subset == 0:
-                            cost[top + r, x, k] = z
-                            if z < best[r, x]:
-                                best[r, x] = z
-                                edge[top + r, x] = e
-                        else:
-                            cost[top + r, x, k] = min(cost[top + r, x, k], z + half_cost)
-
-
-@numba.njit(cache=True)
-def _within(q, subset):
-    # quadrants: 0 upper left, 1 upper right, 2 lower left, 3 lower right
-    if subset == 0:
-        return True
-    if subset == 1:
-        return q % 2 == 0
-    if subset == 2:
-        return q % 2 == 1
-    if subset == 3:
-        return q < 2
-    return q >= 2
-
-
-@numba.njit(parallel=True, fastmath=True, cache=True)
-def semi_global(cost, small, large, total):
-    """Two passes of four directions; large (H, W) penalty of a jump. total (2, H, W, D)."""
-    height, width, count = cost.shape
-    for turn in numba.prange(2):
-        last = np.empty((4, width + 2, count), np.float32)
-        low = np.empty((4, width + 2), np.float32)
-        new = np.empty((4, width + 2, count), np.float32)
-        newlow = np.empty((4, width + 2), np.float32)
-        last[:] = 0
-        low[:] = 0
-        for r0 in range(height):
-            r = r0 if turn == 0 else height - 1 - r0
-            new[:] = 0
-            newlow[:] = 0
-            for c0 in range(width):
-                c = c0 if turn == 0 else width - 1 - c0
-                jump = large[r, c]
-                for way in range(4):
-                    if way == 0:
-                        before = new[0, c0]
-                        least = newlow[0, c0]
-                    else:
-                        before = last[way, c0 + way - 1]
-                        least = low[way, c0 + way - 1]
-                    here = new[way, c0 + 1]
-                    bottom = np.float32(1e9)
-                    for k in range(count):
-                        z = min(before[k], least + jump)
-                        if k > 0:
-                            z = min(z, before[k - 1] + small)
-                        if k < count - 1:
-                            z = min(z, before[k + 1] + small)
-                        z += cost[r, c, k] - least
-                        here[k] = z
-                        bottom = min(bottom, z)
-                        total[turn, r, c, k] += z
-                    newlow[way, c0 + 1] = bottom
-            last, new = new, last
-            low, newlow = newlow, low
+    Notes
+    -----
+    Sources: R. Collins, "A space-sweep approach to true multi-image matching" (CVPR 1996), for the
+    sweep; H. Hirschmueller, "Stereo processing by semiglobal matching" (PAMI 30, 2008), for the
+    smoothing of the evidence; D. Min et al., "Fast global image smoothing" (TIP 23, 2014), for the
+    filling.
+    """
+    image = views.image.numpy()
+    reach = float(np.abs(lattice.baseline).max())
+    count = 1 + max(4, int(np.ceil((nearest - farthest) * reach / _STEP)))
+    planes = np.linspace(farthest, nearest, count)
+    feature, steepness = _features(image, noise)
+    middle = [slice(None)] + [slice(views.margin, -views.margin)] * 2
+    level = image[tuple(middle)].mean((1, 2))
+    weight = np.maximum(level, 0) / np.sqrt(noise)  # edges grow with the light behind a filter
+    cost = np.empty((*lattice.field, count), np.float32)
+    evidence = np.empty(lattice.field, np.float32)
+    _sweep(
+        feature, weight.astype(np.float32), views.margin + views.offset, lattice.baseline,
+        _quadrants(lattice), planes, _bell(_WINDOW), np.float32(_HALF), cost, evidence,
+    )  # fmt: skip
+    spread = float(np.percentile(np.ptp(cost, -1), 90))
+    total = np.zeros((2, *cost.shape), np.float32)
+    strength = np.sqrt(np.maximum(evidence - 2, 0))
+    jump = np.exp(-strength / (3 * np.median(strength) + 1e-6))
+    _semi_global(
+        cost, np.float32(_SLANT * spread), (spread * (_JUMP * jump + 2 * _SLANT)).astype(np.float32),
+        total,
+    )  # fmt: skip
+    rough = _lowest(total[0] + total[1], planes)
+    disparity = _settle(rough, evidence, _picture(views, lattice, level, rough))
+    deviation = 1 / np.sqrt(np.maximum(evidence - 2, 1e-3)) * steepness
+    return Depth(disparity, deviation.astype(np.float32), seen(disparity, lattice.baseline))
