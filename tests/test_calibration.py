@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from conftest import small_design
-from squilla.calibration.alignment import align, measure, sinc_kernel, sub_images
+from squilla.calibration.alignment import align, measure, sub_images
 from squilla.calibration.calibrate import calibrate
 from squilla.calibration.calibration import Calibration
 from squilla.calibration.disparity import edges, find_offsets
 from squilla.calibration.geometry import find_windows
 from squilla.calibration.pixels import Darks, Stack, noise_of
 from squilla.calibration.rehearsal import Rehearsal, poster
+from squilla.calibration.resample import SINC, sinc_kernel
 from squilla.calibration.sensitivity import unfold
 from squilla.calibration.store import load_calibration
 from squilla.camera.design import CameraDesign, Effects
@@ -200,6 +201,8 @@ def test_resampling_keeps_the_picture():
     tap = np.arange(8) - 3
     for fraction in (0.0, 0.1, 0.25, 0.5, 0.9):
         kernel = sinc_kernel(fraction)
+        by_powers = SINC @ (fraction - 0.5) ** np.arange(6)
+        np.testing.assert_allclose(by_powers, kernel, atol=5e-5)
         for frequency in (0.0, 0.1, 0.2, 0.3):
             response = (kernel * np.exp(2j * np.pi * frequency * (tap - fraction))).sum()
             assert abs(response - 1) < 0.006, (fraction, frequency)
