@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.depth import Depth, find_depth
 from squilla.calibration.disparity import edges, find_disparity
 from squilla.calibration.resample import SINC, resample
 from squilla.errors import InputError
@@ -25,12 +26,14 @@ class Measurement:
     """The aligned measurement: what the filters saw of each point of the reference view.
 
     y : (H, W, M) float32, DN per ms, corrected for dark and flat.
-    valid : (H, W, M) bool; False where saturated, defective or outside the sensor.
+    valid : (H, W, M) bool; False where saturated, defective, outside the sensor or hidden from the
+        unit by something nearer.
     angle : (H, W) field angle, rad.
     disparity : (H, W) px per lens pitch.
     snr : (H, W) signal-to-noise ratio of each point over its channels, dB, by the sensor's
         calibrated noise; None if unknown.
     provenance : how it was made; plain numbers and strings.
+    depth : how far away every point is; None where the scene was taken as a plane.
     """
 
     y: Tensor
@@ -39,10 +42,16 @@ class Measurement:
     disparity: Tensor
     snr: Tensor | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
+    depth: Depth | None = None
 
 
 def measure(
-    raw: Raw, calibration: Calibration, *, distance: float | None = None, nearest: float = 60.0
+    raw: Raw,
+    calibration: Calibration,
+    *,
+    distance: float | None = None,
+    nearest: float = 60.0,
+    depth: bool = False,
 ) -> Measurement:
     """Turn a raw frame into the aligned measurement.
 
@@ -55,6 +64,8 @@ def measure(
         Distance of the scene's plane, mm; by default it is found from the scene itself.
     nearest : float
         The shortest distance that is looked for, mm.
+    depth : bool
+        Find a distance for every point instead of one for the whole scene.
 
     Returns
     -------
@@ -64,7 +75,8 @@ def measure(
     ------
     InputError
         If the calibration is of another camera or knows no geometry, if the frame is dark or
-        saturated, or if a distance is so short that sub-images would shift by a whole pitch.
+        saturated, if a distance is so short that sub-images would shift by a whole pitch, or if
+        one distance is given and one for every point wanted.
     """
     lattice, pixels = _fitting(raw, calibration)
     shortest = lattice.distance(lattice.pitch)
@@ -73,13 +85,20 @@ def measure(
             raise InputError(
                 f"The distance must be a number of mm above {shortest:g}, not {given:g}."
             )
+    if depth and distance is not None:
+        raise InputError("Give either the distance of the scene or depth, which finds it.")
     farthest = float(np.abs(lattice.baseline).max())
     closest = nearest if distance is None else distance
     margin = int(np.ceil(lattice.disparity(closest) * farthest)) + _TAPS
     views = sub_images(raw, lattice, pixels, margin)
     snr = _judge(views, raw, pixels)
-    score = 1.0
-    if distance is not None:
+    score, relief, seen = 1.0, None, True
+    if depth:
+        noise = _noise_variance(views, pixels)
+        disparity, deviation, seen = find_depth(views, lattice, noise, lattice.disparity(nearest))
+        relief = Depth.of(disparity, deviation, lattice)
+        score, how = float(relief.confident.float().mean()), "a distance for every point"
+    elif distance is not None:
         disparity, how = lattice.disparity(distance), "from the given distance"
     else:
         noise = _noise_variance(views, pixels)
@@ -93,23 +112,24 @@ def measure(
     y, valid = align(views, lattice, disparity)
     snr_of_point = _pointwise_snr(y, pixels)
     y = y / (raw.exposure or 1.0)
-    shape = lattice.field
+    typical = float(np.median(disparity))
     return Measurement(
         y,
-        valid,
+        valid & torch.as_tensor(seen),
         torch.from_numpy(lattice.field_angle()).float(),
-        torch.full(shape, float(disparity)),
+        torch.from_numpy(np.broadcast_to(np.float32(disparity), lattice.field).copy()),
         snr_of_point,
         {
             "snr": snr,
             "camera": raw.metadata.get("camera", "unknown"),
             "exposure": raw.exposure or 0.0,
             "unit": "DN/ms" if raw.exposure else "DN, exposure unknown",
-            "disparity": disparity,
-            "distance": lattice.distance(disparity),
+            "disparity": typical,
+            "distance": lattice.distance(typical),
             "alignment": how,
             "alignment_score": score,
         },
+        relief,
     )
 
 
