@@ -50,7 +50,7 @@ def demo(
 
 
 def simulate(
-    scene: Annotated[str, typer.Argument(help="chart, indian-pines, corn-kernel, or a file.")],
+    scene: Annotated[str, typer.Argument(help="chart, indian-pines, corn-kernel, doll, or a file.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Raw frame to write.")],
     camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
     distance: Annotated[float, typer.Option(help="Of a plane scene, mm.")] = 300.0,
@@ -69,6 +69,7 @@ def simulate(
     import torch
 
     from squilla.camera.scenes import load_scene
+    from squilla.camera.solid import solid_scene
     from squilla.camera.twin import Camera
     from squilla.files.cube import save
     from squilla.files.raw import write_raw
@@ -76,8 +77,13 @@ def simulate(
     if snr is None and exposure is None:
         snr = 20.0
     twin = Camera(camera)
-    picture = load_scene(scene, twin.design.wavelength, twin.design.field.size)
-    relief = None if depth is None else read_depth(depth, picture.shape[:2])
+    wavelength, size = twin.design.wavelength, twin.design.field.size
+    if scene == "doll":  # brings its own depth
+        picture, relief = solid_scene(wavelength, size, distance=distance)
+    else:
+        picture, relief = load_scene(scene, wavelength, size), None
+    if depth is not None:
+        relief = read_depth(depth, picture.shape[:2])
     raw = twin.capture(
         picture,
         distance=distance,
@@ -148,6 +154,9 @@ def reconstruct(
     distance: Annotated[
         float | None, typer.Option(help="Of the scene, mm; default: found from it.")
     ] = None,
+    depth: Annotated[
+        bool, typer.Option("--depth", help="Find the distance of every point; save it too.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Turn raw frames into hyperspectral cubes.
@@ -173,17 +182,20 @@ def reconstruct(
     reconstructor = load_model(model, camera)
     written = []
     for path in track(raw, "frames", disable=as_json or not many):
-        measurement = measure(read_raw(path), camera, distance=distance)
+        measurement = measure(read_raw(path), camera, distance=distance, depth=depth)
         target = output / f"{path.stem}.nc" if into else output
-        save(reconstructor.reconstruct(measurement), target)
+        extra = measurement.depth.arrays() if measurement.depth else None
+        save(reconstructor.reconstruct(measurement), target, extra=extra)
         written.append({"file": str(target), **measurement.provenance})
     if as_json:
         typer.echo(json.dumps(written))
         return
     for one in written:
+        plane = f"plane at {one['distance']:.0f} mm ({one['alignment']}, agreement "
+        relief = f"{one['alignment']}, {one['distance']:.0f} mm in the median (textured "
         typer.echo(
-            f"{one['file']}: {one['snr']:.1f} dB, plane at {one['distance']:.0f} mm "
-            f"({one['alignment']}, agreement {one['alignment_score']:.2f})"
+            f"{one['file']}: {one['snr']:.1f} dB, {relief if depth else plane}"
+            f"{one['alignment_score']:.2f})"
         )
 
 
