@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from conftest import small_design
-from squilla.calibration.alignment import align, measure, sinc_kernel, sub_images
+from squilla.calibration.alignment import align, measure, sub_images
 from squilla.calibration.calibrate import calibrate
 from squilla.calibration.calibration import Calibration
 from squilla.calibration.disparity import edges, find_offsets
 from squilla.calibration.geometry import find_windows
 from squilla.calibration.pixels import Darks, Stack, noise_of
 from squilla.calibration.rehearsal import Rehearsal, poster
+from squilla.calibration.resample import SINC, sinc_kernel
 from squilla.calibration.sensitivity import unfold
 from squilla.calibration.store import load_calibration
 from squilla.camera.design import CameraDesign, Effects
@@ -199,7 +200,9 @@ def test_resampling_keeps_the_picture():
     """The filter passes frequencies up to 0.3 cycles per px at any shift within 0.6 %."""
     tap = np.arange(8) - 3
     for fraction in (0.0, 0.1, 0.25, 0.5, 0.9):
-        kernel = sinc_kernel(torch.tensor(fraction)).numpy()
+        kernel = sinc_kernel(fraction)
+        by_powers = SINC @ (fraction - 0.5) ** np.arange(6)
+        np.testing.assert_allclose(by_powers, kernel, atol=5e-5)
         for frequency in (0.0, 0.1, 0.2, 0.3):
             response = (kernel * np.exp(2j * np.pi * frequency * (tap - fraction))).sum()
             assert abs(response - 1) < 0.006, (fraction, frequency)
@@ -223,6 +226,14 @@ def test_alignment_moves_a_ramp_exactly(calibration, design):
         expected = start[unit, 0] + row + 2 * (start[unit, 1] + column)
         np.testing.assert_allclose(aligned[..., unit].numpy(), expected, atol=0.05)
     assert valid.all()
+    row, column = np.mgrid[: design.field.size, : design.field.size]
+    tilted = 0.6 + 0.004 * (row - half) - 0.006 * (column - half)
+    aligned, _ = align(views, lattice, tilted)
+    origin = lattice.centre - half
+    for unit in (0, 7, 15):
+        y = origin[unit, 0] + row + tilted * lattice.baseline[unit, 0]
+        x = origin[unit, 1] + column + tilted * lattice.baseline[unit, 1]
+        np.testing.assert_allclose(aligned[..., unit].numpy(), y + 2 * x, atol=0.05)
 
 
 def test_a_saturated_pixel_is_marked_and_healed(camera, calibration, scene):

@@ -39,11 +39,13 @@ class Recipe:
     calibration : path of the camera's calibration.
     model : name or file of a model.
     distance : of the scenes, mm; None if it is found from each of them.
+    depth : whether to find a distance for every point instead.
     """
 
     calibration: Path
     model: str = "ridge"
     distance: float | None = None
+    depth: bool = False
 
     def state(self) -> dict[str, Any]:
         """Return all that decides what comes out, to tell whether a run may go on."""
@@ -165,13 +167,32 @@ def _one(frame: Frame, recipe: Recipe, sink: _Sink) -> dict[str, Any]:
     return {"source": stamp(frame.path), "seconds": seconds, **provenance}
 
 
-def _cube(frame: Frame, recipe: Recipe) -> "tuple[xr.Dataset, dict[str, Any]]":
+def reconstruct_one(
+    frame: Frame, recipe: Recipe
+) -> "tuple[xr.DataArray, dict[str, xr.DataArray], dict[str, Any]]":
+    """Measure and reconstruct one capture.
+
+    Returns
+    -------
+    cube : DataArray, (y, x, wavelength)
+    extra : what belongs to it, such as its depth, by name
+    provenance : of the measurement
+    """
     from squilla.calibration.alignment import measure
 
+    calibration, model = _loaded(recipe, json.dumps(recipe.state(), sort_keys=True))
+    raw = frame.read()
+    measurement = measure(raw, calibration, distance=recipe.distance, depth=recipe.depth)
+    extra = measurement.depth.arrays() if measurement.depth else {}
+    return model.reconstruct(measurement), extra, measurement.provenance
+
+
+def _cube(frame: Frame, recipe: Recipe) -> "tuple[xr.Dataset, dict[str, Any]]":
+    import xarray as xr
+
     with _one_thread():
-        calibration, model = _loaded(recipe, json.dumps(recipe.state(), sort_keys=True))
-        measurement = measure(frame.read(), calibration, distance=recipe.distance)
-        return model.reconstruct(measurement).to_dataset(), measurement.provenance
+        cube, extra, provenance = reconstruct_one(frame, recipe)
+    return xr.Dataset({str(cube.name): cube, **extra}), provenance
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The main job, end to end: three scenes through the camera of the thesis and back.
+"""The main job, end to end: four scenes through the camera of the thesis and back.
 
 The twin takes calibration frames and one frame of each scene; everything after that knows only
 those frames. The truth comes back at the end, to judge.
@@ -23,6 +23,7 @@ from squilla.calibration.calibration import Calibration
 from squilla.calibration.rehearsal import Rehearsal
 from squilla.calibration.store import load_calibration
 from squilla.camera.scenes import SCENES, chart_layout, load_scene
+from squilla.camera.solid import solid_scene
 from squilla.camera.twin import Camera, Truth
 from squilla.errors import InputError
 from squilla.evaluation.report import Trial, results_section, scene_section, write_report
@@ -38,6 +39,7 @@ _TEXT = {
     "chart": "The 24 patches of a ColorChecker. The thesis averages its errors over the first 18.",
     "indian-pines": "Fields in Indiana seen by AVIRIS, taken as a flat picture.",
     "corn-kernel": "A corn kernel from a laboratory hyperspectral camera, enlarged eight times.",
+    "doll": "A doll before a curtain, 40 mm deep: every point is aligned at its own distance.",
 }
 
 T = TypeVar("T")
@@ -47,7 +49,7 @@ def demo(
     folder: str | Path,
     *,
     camera: str | Path = "thesis",
-    scenes: Iterable[str] = SCENES,
+    scenes: Iterable[str] = (*SCENES, "doll"),
     models: Iterable[str] = MODELS,
     distance: float = 300.0,
     snr: float = 20.0,
@@ -92,13 +94,17 @@ def demo(
         reconstructors = {name: load_model(name, calibration) for name in models}
         warm.result()
         for number, name in enumerate(_counted(progress, "scenes", list(scenes))):
-            scene = load_scene(name, twin.design.wavelength, twin.design.field.size)
+            wavelength, size = twin.design.wavelength, twin.design.field.size
+            if name == "doll":
+                scene, relief = solid_scene(wavelength, size, distance=distance)
+            else:
+                scene, relief = load_scene(name, wavelength, size), None
             generator = torch.Generator().manual_seed(1000 * seed + number)
-            raw = twin.capture(scene, distance=distance, snr=snr, generator=generator)
+            raw = twin.capture(scene, distance=distance, depth=relief, snr=snr, generator=generator)
             path = folder / (f"raw-{name}.tiff" if number else "raw.tiff")
             write_raw(path, raw)
             raw = read_raw(path)
-            measurement = measure(raw, calibration)
+            measurement = measure(raw, calibration, depth=relief is not None)
             cubes, seconds = {}, {}
             for model, reconstructor in reconstructors.items():
                 start = perf_counter()
@@ -106,7 +112,7 @@ def demo(
                 seconds[model] = perf_counter() - start
                 for suffix in (".nc", ".hdr"):
                     save(cubes[model], folder / f"{name}-{model}{suffix}")
-            truth = twin.truth(scene, distance=distance)
+            truth = twin.truth(scene, distance=distance, depth=relief)
             trial = _trial(name, truth, cubes, seconds, raw, calibration, measurement)
             trials.append(trial)
             metrics[name] = {
@@ -128,7 +134,7 @@ def demo(
             folder / "report.html",
             sections,
             title="From one exposure to a spectrum in every pixel",
-            text="Three scenes seen once by the digital twin of the thesis' camera and "
+            text="Scenes seen once by the digital twin of the thesis' camera and "
             "reconstructed from its raw frames alone. The truth is used only to judge.",
             facts=facts,
         )
@@ -138,15 +144,20 @@ def demo(
 def alignment_error(calibration: Calibration, measurement: Measurement, truth: Truth) -> float:
     """Return the RMS error of where the sub-images were aligned, px; for judging only.
 
-    Over all units, against the reference, at the mean disparity of a plane scene.
+    Over all units, against the reference, and over all points of a scene with depth.
     """
     lattice = calibration.lattice
     assert lattice is not None
-    reference, found = lattice.reference, float(measurement.disparity.mean())
-    placed = lattice.centre + found * lattice.baseline
+    reference = lattice.reference
     apart = truth.centres - truth.centres[reference]
-    right = apart * (1 + float(truth.disparity.mean()) / lattice.pitch)
-    return float(np.sqrt(np.mean((placed - placed[reference] - right) ** 2)))
+    offset = lattice.centre - lattice.centre[reference] - apart
+    found, right = (
+        each.reshape(-1, 1, 1) for each in (measurement.disparity.numpy(), truth.disparity)
+    )
+    if np.ptp(found) == np.ptp(right) == 0:
+        found, right = found[:1], right[:1]
+    error = offset + found * lattice.baseline - right * apart / lattice.pitch
+    return float(np.sqrt(np.mean(error**2)))
 
 
 def _calibrate(twin: Camera, seed: int, progress: Progress) -> Calibration:
@@ -197,6 +208,7 @@ def _trial(
         after=measurement.y.permute(2, 0, 1).numpy(),
         disparity=measurement.disparity.numpy(),
         labels=chart_layout(*lattice.field) if name == "chart" and lattice is not None else None,
+        depth=measurement.depth,
     )  # fmt: skip
 
 

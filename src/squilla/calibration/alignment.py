@@ -7,16 +7,16 @@ import numba
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.depth import Depth, find_depth
 from squilla.calibration.disparity import edges, find_disparity
+from squilla.calibration.resample import SINC, resample
 from squilla.calibration.stray import stray_light
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 
-_TAPS = 8
-"""Length of the resampling filter, px."""
+_TAPS = SINC.shape[0]
 
 _TEXTURED = 0.1
 """Mean correlation of the sub-images' edges below which they agree by chance."""
@@ -27,12 +27,14 @@ class Measurement:
     """The aligned measurement: what the filters saw of each point of the reference view.
 
     y : (H, W, M) float32, DN per ms, corrected for dark and flat.
-    valid : (H, W, M) bool; False where saturated, defective or outside the sensor.
+    valid : (H, W, M) bool; False where saturated, defective, outside the sensor or hidden from the
+        unit by something nearer.
     angle : (H, W) field angle, rad.
     disparity : (H, W) px per lens pitch.
     snr : (H, W) signal-to-noise ratio of each point over its channels, dB, by the sensor's
         calibrated noise; None if unknown.
     provenance : how it was made; plain numbers and strings.
+    depth : how far away every point is; None where the scene was taken as a plane.
     """
 
     y: Tensor
@@ -41,10 +43,16 @@ class Measurement:
     disparity: Tensor
     snr: Tensor | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
+    depth: Depth | None = None
 
 
 def measure(
-    raw: Raw, calibration: Calibration, *, distance: float | None = None, nearest: float = 60.0
+    raw: Raw,
+    calibration: Calibration,
+    *,
+    distance: float | None = None,
+    nearest: float = 60.0,
+    depth: bool = False,
 ) -> Measurement:
     """Turn a raw frame into the aligned measurement.
 
@@ -57,6 +65,8 @@ def measure(
         Distance of the scene's plane, mm; by default it is found from the scene itself.
     nearest : float
         The shortest distance that is looked for, mm.
+    depth : bool
+        Find a distance for every point instead of one for the whole scene.
 
     Returns
     -------
@@ -66,7 +76,8 @@ def measure(
     ------
     InputError
         If the calibration is of another camera or knows no geometry, if the frame is dark or
-        saturated, or if a distance is so short that sub-images would shift by a whole pitch.
+        saturated, if a distance is so short that sub-images would shift by a whole pitch, or if
+        one distance is given and one for every point wanted.
     """
     lattice, pixels = _fitting(raw, calibration)
     shortest = lattice.distance(lattice.pitch)
@@ -75,13 +86,20 @@ def measure(
             raise InputError(
                 f"The distance must be a number of mm above {shortest:g}, not {given:g}."
             )
+    if depth and distance is not None:
+        raise InputError("Give either the distance of the scene or depth, which finds it.")
     farthest = float(np.abs(lattice.baseline).max())
     closest = nearest if distance is None else distance
     margin = int(np.ceil(lattice.disparity(closest) * farthest)) + _TAPS
     views = sub_images(raw, lattice, pixels, margin)
     snr = _judge(views, raw, pixels)
-    score = 1.0
-    if distance is not None:
+    score, relief, seen = 1.0, None, True
+    if depth:
+        noise = _noise_variance(views, pixels)
+        disparity, deviation, seen = find_depth(views, lattice, noise, lattice.disparity(nearest))
+        relief = Depth.of(disparity, deviation, lattice)
+        score, how = float(relief.confident.float().mean()), "a distance for every point"
+    elif distance is not None:
         disparity, how = lattice.disparity(distance), "from the given distance"
     else:
         noise = _noise_variance(views, pixels)
@@ -96,24 +114,25 @@ def measure(
     snr_of_point = pointwise_snr(y, pixels)
     signal = float(y.mean())
     y = y / (raw.exposure or 1.0)
-    shape = lattice.field
+    typical = float(np.median(disparity))
     return Measurement(
         y,
-        valid,
+        valid & torch.as_tensor(seen),
         torch.from_numpy(lattice.field_angle()).float(),
-        torch.full(shape, float(disparity)),
+        torch.from_numpy(np.broadcast_to(np.float32(disparity), lattice.field).copy()),
         snr_of_point,
         {
             "snr": snr,
             "camera": raw.metadata.get("camera", "unknown"),
             "exposure": raw.exposure or 0.0,
             "unit": "DN/ms" if raw.exposure else "DN, exposure unknown",
-            "disparity": disparity,
-            "distance": lattice.distance(disparity),
+            "disparity": typical,
+            "distance": lattice.distance(typical),
             "alignment": how,
             "alignment_score": score,
             **stray_light(raw.frame, raw.exposure, pixels, signal),
         },
+        relief,
     )
 
 
@@ -276,15 +295,18 @@ def _fitting(raw: Raw, calibration: Calibration) -> tuple[Lattice, Pixels]:
 # --- resampling -------------------------------------------------------------------------------
 
 
-def align(views: SubImages, lattice: Lattice, disparity: float) -> tuple[Tensor, Tensor]:
+def align(
+    views: SubImages, lattice: Lattice, disparity: float | np.ndarray | Tensor
+) -> tuple[Tensor, Tensor]:
     """Resample every sub-image onto the reference view, once.
 
     Parameters
     ----------
     views : SubImages
     lattice : Lattice
-    disparity : float
-        px per lens pitch; no more than the margin of `views` allows.
+    disparity : float or array, (H, W)
+        px per lens pitch, of the whole scene or of each point of the reference view. What lies
+        beyond the margin of `views` is not valid.
 
     Returns
     -------
@@ -293,33 +315,19 @@ def align(views: SubImages, lattice: Lattice, disparity: float) -> tuple[Tensor,
 
     Notes
     -----
-    A separable windowed sinc of 8 taps (Kaiser, beta 4.5): at every shift its response is within
-    0.6 % of one up to 0.3 cycles per px.
+    By `resample.sinc_kernel`, the only interpolation between the sensor and the measurement.
     """
-    start = views.margin + views.offset + disparity * lattice.baseline
-    first = np.floor(start).astype(int)
-    kernel = sinc_kernel(torch.from_numpy(start - first).float())
-    before = _TAPS // 2 - 1
-    height, width = lattice.field
-    cut, valid = [], []
-    for unit, (row, column) in enumerate(first):
-        rows = slice(row - before, row - before + height + _TAPS - 1)
-        columns = slice(column - before, column - before + width + _TAPS - 1)
-        cut.append(views.image[unit, rows, columns])
-        # A pixel is believed if the four around its position are.
-        near = ~views.bad[unit, row : row + height + 1, column : column + width + 1]
-        valid.append(near[:-1, :-1] & near[1:, :-1] & near[:-1, 1:] & near[1:, 1:])
-    image = torch.stack(cut)[None]
-    units = len(start)
-    image = functional.conv2d(image, kernel[:, 0, None, :, None], groups=units)
-    image = functional.conv2d(image, kernel[:, 1, None, None, :], groups=units)
-    return image[0].permute(1, 2, 0).contiguous(), torch.stack(valid, -1)
-
-
-def sinc_kernel(fraction: Tensor) -> Tensor:
-    """Return the resampling filter for shifts of a fraction of a pixel, (...) -> (..., 8)."""
-    tap = torch.arange(_TAPS) - (_TAPS // 2 - 1)
-    position = tap - fraction[..., None]
-    window = torch.special.i0(4.5 * (1 - (2 * position / _TAPS) ** 2).clamp_min(0).sqrt())
-    kernel = torch.sinc(position) * window
-    return kernel / kernel.sum(-1, keepdim=True)
+    everywhere = np.broadcast_to(np.asarray(disparity, np.float32), lattice.field)
+    y = torch.empty(*lattice.field, len(lattice.centre))
+    valid = torch.empty(y.shape, dtype=torch.bool)
+    resample(
+        views.image.numpy()[None],
+        views.bad.numpy(),
+        lattice.places(views.margin + views.offset),
+        lattice.baseline,
+        everywhere,
+        SINC,
+        y.numpy().transpose(2, 0, 1)[None],
+        valid.numpy().transpose(2, 0, 1),
+    )
+    return y, valid

@@ -20,7 +20,7 @@ class Lattice:
     """Where the sub-images lie on the sensor, and how they move with depth.
 
     A point at inverse depth `disparity` that the reference unit sees at p (px from the centre of
-    its field) is seen by unit i at ``centre[i] + p + disparity * baseline[i]``.
+    its field) is seen by unit i at ``centre[i] + p + disparity * baseline[i] + bend[i](p)``.
 
     shape : (rows, columns) of the array.
     centre : (M, 2) px, (y, x): image of an infinitely distant point on the camera's axis.
@@ -31,6 +31,8 @@ class Lattice:
     pitch : nominal distance of neighbouring lenses, px.
     pixel : size of a pixel, um; gives distances their scale.
     usual : distance at which a scene without texture is taken to be, mm.
+    bend : (M, 2, 9) px, how each unit's view is bent against the reference's: coefficients of y, x,
+        y^2, y x, x^2, y^3, y^2 x, y x^2, x^3 with y, x from -1 to 1 over the field.
     """
 
     shape: tuple[int, int]
@@ -42,6 +44,22 @@ class Lattice:
     pitch: float
     pixel: float
     usual: float
+    bend: np.ndarray | None = None
+
+    def places(self, first: np.ndarray) -> np.ndarray:
+        """Return the polynomial of where units see the points of an infinitely distant plane.
+
+        Parameters
+        ----------
+        first : array, (M, 2)
+            Where each unit sees the reference's first pixel, px, were its view not bent.
+
+        Returns
+        -------
+        array, (M, 2, 10), as `squilla.calibration.resample.resample` wants it
+        """
+        bend = np.zeros((*first.shape, 9)) if self.bend is None else self.bend
+        return np.concatenate([np.asarray(first)[..., None], bend], -1)
 
     def disparity(self, distance: float) -> float:
         """Return the disparity of a plane at `distance` mm, px per lens pitch."""

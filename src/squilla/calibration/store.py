@@ -48,6 +48,8 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     if lattice is not None:
         variables["centre"] = (("unit", "yx"), lattice.centre, px)
         variables["baseline"] = (("unit", "yx"), lattice.baseline, {"units": "lens pitches"})
+        if lattice.bend is not None:
+            variables["bend"] = (("unit", "yx", "power"), lattice.bend, px)
         numbers = ("reference", "focal", "pitch", "pixel", "usual")
         attributes |= {f"lattice_{name}": getattr(lattice, name) for name in numbers}
         attributes |= {"lattice_shape": list(lattice.shape), "lattice_field": list(lattice.field)}
@@ -95,6 +97,7 @@ def load_calibration(path: str | Path) -> Calibration:
                 pitch=float(facts["lattice_pitch"]),
                 pixel=float(facts["lattice_pixel"]),
                 usual=float(facts["lattice_usual"]),
+                bend=dataset["bend"].values if "bend" in dataset else None,
             )
         if "flat" in dataset:
             pixels = Pixels(

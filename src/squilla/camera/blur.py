@@ -10,9 +10,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Blur:
-    """The blur over angle and wavelength as a sum of a few terms weight(a, k) frequency(f).
+    """The blur over angle, wavelength and depth as a sum of terms weight(a, k) frequency(d, f).
 
-    weight : Tensor, (A, r, K).  frequency : (r, F) over `cycles` (F,), cycles per px.
+    weight : Tensor, (A, r, K).  frequency : (D, r, F) over `cycles` (F,), cycles per px.
     displacement : (r, 2) px, by which each term is displaced besides.
     """
 
@@ -23,11 +23,11 @@ class Blur:
 
     @classmethod
     def of(cls, transfer: np.ndarray, cycles: np.ndarray, tolerance: float = 6e-4) -> "Blur":
-        """Separate a transfer function (A, K, F) to a relative tolerance by its SVD.
+        """Separate a transfer function (A, K, D, F) to a relative tolerance by its SVD.
 
         Low frequencies weigh more, for pictures are made of them and light must not be lost.
         """
-        angles, bands, _ = transfer.shape
+        angles, bands, depths, _ = transfer.shape
         importance = 1 / (cycles + 0.01)
         left, values, right = np.linalg.svd(
             (transfer * importance).reshape(angles * bands, -1), False
@@ -36,7 +36,8 @@ class Blur:
         rank = max(1, int(np.sum(lost > tolerance)))
         weight = (left[:, :rank] * values[:rank]).reshape(angles, bands, rank)
         weight = torch.from_numpy(weight).float().permute(0, 2, 1).contiguous()
-        return cls(weight, right[:rank] / importance, cycles, np.zeros((rank, 2)))
+        frequency = right[:rank].reshape(rank, depths, -1) / importance
+        return cls(weight, frequency.transpose(1, 0, 2), cycles, np.zeros((rank, 2)))
 
     def displaced(self, displacement: np.ndarray) -> "Blur":
         """Return the blur displaced by px (y, x) that depend on angle and wavelength, (A, K, 2).
@@ -60,17 +61,20 @@ class Blur:
         share = torch.from_numpy(share).float().permute(1, 0, 2)[:, :, None, :]  # (A, J, 1, K)
         return Blur(
             (share * self.weight[:, None]).flatten(1, 2),
-            np.tile(self.frequency, (count, 1)),
+            np.tile(self.frequency, (1, count, 1)),
             self.cycles,
-            np.repeat(nodes, len(self.frequency))[:, None] * line,
+            np.repeat(nodes, self.frequency.shape[1])[:, None] * line,
         )
 
     def on_grid(self, size: tuple[int, int]) -> Tensor:
-        """Return each term on the grid of a real FFT, times the pixel's aperture, (r, ...)."""
+        """Return each term on the grid of a real FFT, times the pixel's aperture, (D, r, ...)."""
         y, x = np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1])[None, :]
         radius, pixel = np.hypot(y, x), np.sinc(y) * np.sinc(x)
-        terms = np.stack([np.interp(radius, self.cycles, term) for term in self.frequency])
-        transfer = torch.from_numpy(terms * pixel).float()
+        terms = [
+            [np.interp(radius, self.cycles, term) * pixel for term in layer]
+            for layer in self.frequency
+        ]
+        transfer = torch.from_numpy(np.array(terms)).float()
         if self.displacement.any():
             transfer = transfer * torch.stack([shift(-each, size) for each in self.displacement])
         return transfer

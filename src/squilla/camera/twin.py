@@ -56,7 +56,7 @@ class Camera:
     ``design.light.radiance``. One sample falls on one sensor pixel, the middle of the scene on the
     axis of the reference unit (half a pixel beside it where scene and field are not both even or
     both odd), in the orientation of the sub-images. Beyond its edge a scene goes on as its mirror
-    image. A scene with depth is blurred as a plane at its median distance.
+    image. A scene with depth is blurred by the defocus of a few depths, interpolated in between.
 
     Filters and blur at a field angle are interpolated between a few angles, linearly in the squared
     angle; the blur over wavelength and angle is a sum of a few separable terms. So one unit's
@@ -303,7 +303,8 @@ class Camera:
         """
         values = torch.from_numpy(self._values(scene))
         plane = self._disparity(distance, depth, values.shape[:2])
-        blur = self._blur(float(np.median(depth)) if depth is not None else distance)
+        layers = _layers(plane)
+        blur = self._blur(layers)
         reference = self.design.centres[self.design.field.reference]
         baselines = (self.design.centres - reference) / self.design.pitch
         margin = _MARGIN + int(
@@ -312,7 +313,7 @@ class Camera:
         tallest = np.max(
             [[part.stop - part.start for part in window] for window in self.windows], 0
         )
-        height, width = (_fast_length(int(length)) for length in tallest + 2 * margin + 2)
+        height, width = (_fast_length(int(length)) for length in tallest + 2 * margin + 6)
         size = (height, width)
         transfer = blur.on_grid(size)
         response = torch.from_numpy(self._node_response).float()
@@ -329,7 +330,9 @@ class Camera:
         for channel in range(self.design.channels):
             unit = self._unit(channel)
             light = (seen(response[:, channel]), leaking)
-            image = self._project(light, unit, baselines[unit], plane, margin, transfer, size)
+            image = self._project(
+                light, unit, baselines[unit], plane, layers, margin, transfer, size
+            )
             view, part = self._behind(total, channel)
             view += self._geometry[unit][1][part] * np.maximum(image[part], 0)
         return total
@@ -366,11 +369,12 @@ class Camera:
         unit: int,
         baseline: np.ndarray,
         plane: float | np.ndarray,
+        layers: np.ndarray,
         margin: int,
         transfer: Tensor,
         size: tuple[int, int],
     ) -> np.ndarray:
-        """Blur what a unit sees of every scene sample, (y, x, A, r), and lay it on its window.
+        """Lay what a unit sees of every scene sample, (y, x, A, r), on its window, blurred.
 
         seen : through the filter, and through the gap beside it where that is clear.
         """
@@ -383,7 +387,7 @@ class Camera:
         field = self.design.field.size
         centre = [_first(field, length) + (field - 1) / 2 for length in seen[0].shape[:2]]
         origin = on_axis - middle * baseline + centre
-        first = np.floor(origin).astype(int) - margin
+        first = np.floor(origin).astype(int) - margin - 2
         position = on_axis + first - origin
         place = (first, position, self.design.focal, self.angles**2, size)
         canvas = warp.weigh(seen[0], *place)
@@ -393,23 +397,32 @@ class Camera:
             )
             leak = self._through(rows_of_canvas, columns_of_canvas)[1]
             canvas += leak * warp.weigh(seen[1], *place)
-        flat = not isinstance(plane, np.ndarray)
-        if flat:
-            transfer = transfer * shift(origin - first, size)
-        spectrum = (torch.fft.rfft2(torch.from_numpy(canvas)) * transfer).sum(0)
+        if not isinstance(plane, np.ndarray):
+            transfer = transfer[0] * shift(origin - first, size)
+            spectrum = (torch.fft.rfft2(torch.from_numpy(canvas)) * transfer).sum(0)
+            return torch.fft.irfft2(spectrum, s=size).numpy()[:rows, :columns]
+        # The blur comes last: the soft edge of a near thing moves with it.
+        view, hit = warp.relief(canvas, plane, first, origin - _MARGIN, middle, baseline, size)
+        spectrum = torch.zeros(transfer.shape[-2:], dtype=torch.complex64)
+        for layer, each in enumerate(transfer):
+            share = np.interp(hit, layers, np.eye(len(layers))[layer]).astype(np.float32)
+            spectrum += (torch.fft.rfft2(torch.from_numpy(view * share)) * each).sum(0)
         image = torch.fft.irfft2(spectrum, s=size).numpy()
-        if flat:
-            return image[:rows, :columns]
-        return warp.relief(image, plane, first, origin, middle, baseline, (rows, columns))
+        return image[_MARGIN : _MARGIN + rows, _MARGIN : _MARGIN + columns]
 
-    def _blur(self, distance: float) -> Blur:
+    def _blur(self, layers: np.ndarray) -> Blur:
+        """Return the blur at some disparities, px per lens pitch."""
         inner = np.minimum(
             self.angles, self.angles[3]
         )  # outside the field it stays as in its corner
         cycles = np.linspace(0, np.sqrt(0.5), 96)
-        transfer = lens.transfer_function(self.design, inner, distance, cycles)
-        blur = Blur.of(transfer, cycles)
-        return blur.displaced(lens.lateral_colour(self.design, inner, distance))
+        far = self.design.array.pitch / 1000 * self.design.focal
+        transfer = [
+            lens.transfer_function(self.design, inner, far / float(layer), cycles)
+            for layer in layers
+        ]
+        blur = Blur.of(np.stack(transfer, 2), cycles)
+        return blur.displaced(lens.lateral_colour(self.design, inner, far / float(layers.mean())))
 
     @cached_property
     def _geometry(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -472,6 +485,17 @@ class Camera:
         if values.min() < 0:
             raise InputError("The scene holds negative radiance; clip it at zero before capturing.")
         return values
+
+
+def _layers(plane: float | np.ndarray) -> np.ndarray:
+    """Return the disparities at which the defocus is computed, rising; one for a plane.
+
+    From one to the next its radius changes by 0.4 px at the most.
+    """
+    if not isinstance(plane, np.ndarray):
+        return np.array([plane])
+    low, high = float(plane.min()), float(plane.max())
+    return np.linspace(low, high, 1 + max(1, int(np.ceil(high - low))))
 
 
 def _first(size: int, length: int) -> int:

@@ -32,7 +32,7 @@ def relief(
     mean: float,
     baseline: np.ndarray,
     shape: tuple[int, int],
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the view of a scene with depth from a lens beside the reference lens.
 
     The scene is a relief over the reference view: what stands out is extruded from its back, so
@@ -40,34 +40,37 @@ def relief(
 
     Parameters
     ----------
-    image : array, (y, x)
+    image : array, (r, y, x)
         What this unit sees of the scene, on the reference view's grid, from `first` on.
     disparity : array, (rows, columns)
         Of every scene sample, px per lens pitch; goes on mirrored.
     first : (2,) int
         Scene index of the first pixel of `image`.
     origin : (2,) float
-        Scene position of the window's first pixel for a plane of the mean disparity.
+        Scene position of the view's first pixel for a plane of the mean disparity.
     mean : float
         Mean disparity.
     baseline : (2,) float
         Of the unit, lens pitches.
     shape : (int, int)
-        Of the window.
+        Of the view.
 
     Returns
     -------
-    array, `shape`, float32
+    view : array, (r, *shape), float32
+    hit : array, `shape`, float32
+        Disparity of what is seen.
     """
     reach = max(float(np.abs(baseline).max()), 1e-9)
     top, bottom = float(disparity.max()), float(disparity.min())
     steps = max(1, int(np.ceil((top - bottom) * reach * 4)))  # a quarter of a pixel a step
-    view = np.empty(shape, np.float32)
+    view = np.empty((len(image), *shape), np.float32)
+    depth = np.empty(shape, np.float32)
     _cast(
         image, np.ascontiguousarray(disparity, np.float64), first.astype(np.float64), origin,
-        mean, baseline, top, bottom, steps, view,
+        mean, baseline, top, bottom, steps, view, depth,
     )  # fmt: skip
-    return view
+    return view, depth
 
 
 def weigh(
@@ -151,8 +154,8 @@ def _cubic(t):
 
 
 @numba.njit(parallel=True, cache=True)
-def _cast(image, disparity, first, origin, mean, baseline, top, bottom, steps, view):
-    rows, columns = view.shape
+def _cast(image, disparity, first, origin, mean, baseline, top, bottom, steps, view, depth):
+    terms, rows, columns = view.shape
     for row in numba.prange(rows):
         for column in range(columns):
             # The ray meets depth d at the scene position base - (d - mean) * baseline.
@@ -177,12 +180,16 @@ def _cast(image, disparity, first, origin, mean, baseline, top, bottom, steps, v
                         hit = front + (back - front) * gap / (gap - below)
                         break
                     front, gap = back, below
+            depth[row, column] = hit
             y = base_y - (hit - mean) * baseline[0] - first[0]
             x = base_x - (hit - mean) * baseline[1] - first[1]
             i, j = int(np.floor(y)), int(np.floor(x))
             weight_y, weight_x = _cubic(y - i), _cubic(x - j)
-            total = 0.0
-            for k in range(4):
-                for m in range(4):
-                    total += weight_y[k] * weight_x[m] * image[i - 1 + k, j - 1 + m]
-            view[row, column] = total
+            # The canvas is mirrored beyond the scene already; what lies beyond it is not seen.
+            i, j = min(max(i, 1), image.shape[1] - 3), min(max(j, 1), image.shape[2] - 3)
+            for term in range(terms):
+                total = 0.0
+                for k in range(4):
+                    for m in range(4):
+                        total += weight_y[k] * weight_x[m] * image[term, i - 1 + k, j - 1 + m]
+                view[term, row, column] = total

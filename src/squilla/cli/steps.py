@@ -11,6 +11,7 @@ import typer
 from squilla.errors import InputError
 
 if TYPE_CHECKING:
+    from squilla.batch import Recipe
     from squilla.calibration.sensitivity import SweepStep
     from squilla.files.raw import Frame
 
@@ -51,7 +52,9 @@ def demo(
 
 
 def simulate(
-    scene: Annotated[str, typer.Argument(help="chart, indian-pines, corn-kernel, or a file.")],
+    scene: Annotated[
+        str, typer.Argument(help="chart, indian-pines, corn-kernel, doll, or a file.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Raw frame to write.")],
     camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
     distance: Annotated[float, typer.Option(help="Of a plane scene, mm.")] = 300.0,
@@ -70,6 +73,7 @@ def simulate(
     import torch
 
     from squilla.camera.scenes import load_scene
+    from squilla.camera.solid import solid_scene
     from squilla.camera.twin import Camera
     from squilla.files.cube import save
     from squilla.files.raw import write_raw
@@ -77,8 +81,13 @@ def simulate(
     if snr is None and exposure is None:
         snr = 20.0
     twin = Camera(camera)
-    picture = load_scene(scene, twin.design.wavelength, twin.design.field.size)
-    relief = None if depth is None else read_depth(depth, picture.shape[:2])
+    wavelength, size = twin.design.wavelength, twin.design.field.size
+    if scene == "doll":  # brings its own depth
+        picture, relief = solid_scene(wavelength, size, distance=distance)
+    else:
+        picture, relief = load_scene(scene, wavelength, size), None
+    if depth is not None:
+        relief = read_depth(depth, picture.shape[:2])
     raw = twin.capture(
         picture,
         distance=distance,
@@ -149,6 +158,9 @@ def reconstruct(
     distance: Annotated[
         float | None, typer.Option(help="Of the scene, mm; default: found from it.")
     ] = None,
+    depth: Annotated[
+        bool, typer.Option("--depth", help="Find the distance of every point; save it too.")
+    ] = False,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes for many frames; default: every core.")
     ] = None,
@@ -165,36 +177,35 @@ def reconstruct(
     Examples: squilla reconstruct raw.tiff --calibration camera.nc --model ridge -o cube.nc;
     squilla reconstruct night/ --calibration camera.nc --model mlp -o night.zarr
     """
+    from squilla.batch import Recipe, reconstruct_one
+    from squilla.files.cube import save
     from squilla.files.raw import list_frames
 
     frames = [frame for path in raw for frame in list_frames(path)]
+    recipe = Recipe(calibration, model, distance, depth)
     into = output.is_dir() and output.suffix != ".zarr"
-    if len(frames) == 1 and not into:
-        _reconstruct_one(frames[0], calibration, model, output, distance, as_json)
+    if len(frames) > 1 or into:
+        if not into and output.suffix != ".zarr":
+            raise InputError(
+                f"For several raw frames {output} must be an existing folder or a .zarr."
+            )
+        _reconstruct_many(frames, recipe, output, workers, scheduler, as_json)
         return
-    if not into and output.suffix != ".zarr":
-        raise InputError(f"For several raw frames {output} must be an existing folder or a .zarr.")
-    _reconstruct_many(frames, calibration, model, output, distance, workers, scheduler, as_json)
-
-
-def _reconstruct_one(
-    frame: "Frame", calibration: Path, model: str, output: Path, distance: float | None,
-    as_json: bool,
-) -> None:  # fmt: skip
-    from squilla.calibration.alignment import measure
-    from squilla.calibration.store import load_calibration
-    from squilla.files.cube import save
-    from squilla.reconstruction.reconstructor import load_model
-
-    camera = load_calibration(calibration)
-    measurement = measure(frame.read(), camera, distance=distance)
-    save(load_model(model, camera).reconstruct(measurement), output)
-    told = {"file": str(output), **measurement.provenance}
-    typer.echo(json.dumps(told) if as_json else _sentence(str(output), told))
+    cube, extra, told = reconstruct_one(frames[0], recipe)
+    save(cube, output, extra=extra)
+    if as_json:
+        typer.echo(json.dumps({"file": str(output), **told}))
+        return
+    plane = f"plane at {told['distance']:.0f} mm ({told['alignment']}, agreement "
+    relief = f"{told['alignment']}, {told['distance']:.0f} mm in the median (textured "
+    typer.echo(
+        f"{output}: {told['snr']:.1f} dB, {relief if depth else plane}"
+        f"{told['alignment_score']:.2f})"
+    )
 
 
 def _reconstruct_many(
-    frames: "list[Frame]", calibration: Path, model: str, output: Path, distance: float | None,
+    frames: "list[Frame]", recipe: "Recipe", output: Path,
     workers: int | None, scheduler: str | None, as_json: bool,
 ) -> None:  # fmt: skip
     from dataclasses import asdict
@@ -208,14 +219,14 @@ def _reconstruct_many(
         TimeRemainingColumn,
     )
 
-    from squilla.batch import Recipe, reconstruct_all
+    from squilla.batch import reconstruct_all
 
     columns = TextColumn("captures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=Console(stderr=True), disable=as_json) as progress:
         bar = progress.add_task("captures", total=len(frames))
         summary = reconstruct_all(
             frames,
-            Recipe(calibration, model, distance),
+            recipe,
             output,
             workers=workers,
             scheduler=scheduler,
@@ -232,13 +243,6 @@ def _reconstruct_many(
             typer.echo(f"{name}: {why}", err=True)
     if summary.failed:
         raise typer.Exit(1)
-
-
-def _sentence(name: str, told: dict) -> str:
-    return (
-        f"{name}: {told['snr']:.1f} dB, plane at {told['distance']:.0f} mm "
-        f"({told['alignment']}, agreement {told['alignment_score']:.2f})"
-    )
 
 
 def evaluate(

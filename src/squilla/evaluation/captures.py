@@ -130,6 +130,30 @@ def disparity_figure(disparity: np.ndarray) -> "Figure":
     return figure
 
 
+@styled
+def depth_figure(distance: np.ndarray, confident: np.ndarray) -> "Figure":
+    """Draw how far away every point is, and beside it only what its own texture tells.
+
+    Parameters
+    ----------
+    distance : array, (H, W)
+        mm.
+    confident : array, (H, W) bool
+        Points that have enough texture; the others are filled in from their neighbours.
+    """
+    import matplotlib
+
+    low, high = np.percentile(distance[confident] if confident.any() else distance, (0.5, 99.5))
+    colours = matplotlib.colormaps["viridis_r"].with_extremes(bad=EMPTY)
+    figure = sheet(1, 2, distance.shape[0] / distance.shape[1], 0.8 * WIDTH, colour_bar=True)
+    maps = {"every point": distance, "by its own texture": np.where(confident, distance, np.nan)}
+    for axes, (title, each) in zip(figure.axes, maps.items(), strict=True):
+        limits = {"vmin": low, "vmax": max(high, low + 1)}
+        picture = draw_picture(axes, each, title, cmap=colours, **limits)
+    draw_colour_bar(figure, picture, "distance (mm)")
+    return figure
+
+
 def _mosaic(images: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Join the sub-images into one picture with white seams, square root of a scale to 1."""
     count, height, width = images.shape

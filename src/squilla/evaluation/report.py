@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from squilla.calibration.calibration import Lattice
+    from squilla.calibration.depth import Depth
 
 
 # --- what goes in ---------------------------------------------------------------------------------
@@ -47,6 +48,7 @@ class Trial:
     before, after : (M, H, W) sub-images as they lie on the lattice, and aligned.
     disparity : (H, W) px per lens pitch.
     labels : (H, W) patches of a colour chart, -1 between them (`chart_layout`).
+    depth : how far away every point was found to be.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Trial:
     after: np.ndarray | None = None
     disparity: np.ndarray | None = None
     labels: np.ndarray | None = None
+    depth: "Depth | None" = None
 
     def __post_init__(self):
         if not self.estimates:
@@ -229,7 +232,17 @@ def _capture_parts(trial: Trial) -> list[Illustration]:
                 "are edges on which they agree.",
             )
         )
-    if trial.disparity is not None and np.ptp(trial.disparity) > 0 and lattice is not None:
+    if trial.depth is not None:
+        distance, confident = trial.depth.distance.numpy(), trial.depth.confident.numpy()
+        parts.append(
+            Illustration(
+                captures.depth_figure(distance, confident),
+                "The distance that was found for every point. Where it is grey on the right there "
+                f"is too little texture ({100 * (1 - confident.mean()):.0f} % of the points), and "
+                "the left is filled in from the neighbours.",
+            )
+        )
+    elif trial.disparity is not None and np.ptp(trial.disparity) > 0 and lattice is not None:
         near, far = np.nanpercentile(trial.disparity, (99, 1))
         parts.append(
             Illustration(
