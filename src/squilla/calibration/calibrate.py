@@ -9,10 +9,17 @@ from squilla.calibration.alignment import windows
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.geometry import lattice_from_flat, refine_with_target
 from squilla.calibration.pixels import Darks, Stack, defective, noise_of
-from squilla.calibration.sensitivity import SweepStep, Zones, sweep_responses, unfold
+from squilla.calibration.sensitivity import (
+    SweepStep,
+    Zones,
+    sweep_responses,
+    sweep_sensitivity,
+)
 from squilla.camera.design import CameraDesign
+from squilla.camera.lens import cone
 from squilla.errors import InputError
 from squilla.files.raw import Raw
+from squilla.optics.angle import fit_effective_index
 
 
 def calibrate(
@@ -87,23 +94,34 @@ def calibrate(
 
     bias = np.where(lit, darks.bias, np.median(darks.bias)).astype(np.float32)
     dark_rate = np.where(lit, darks.rate, 0).astype(np.float32)
-    wavelength, bandwidth, response = sweep_responses(sweep, darks, relative, saturation, zones)
-    sensitivity = np.maximum(unfold(wavelength, bandwidth, response, design.wavelength), 0)
+    responses = sweep_responses(sweep, darks, relative, saturation, zones)
+    found, doubts = sweep_sensitivity(responses, design.wavelength)
+    sensitivity = np.maximum(found.sensitivity, 0)
     return Calibration(
         design.wavelength,
         sensitivity,
         zones.angle,
         lattice,
         Pixels(bias, dark_rate, relative, valid, saturation, gain, read_noise),
+        found.deviations,
         {
             "software": f"squilla {__version__}",
             "design": design.name,
             "camera": flats.camera,
-            "sweep_steps": len(wavelength),
+            "sweep_steps": len(found.power_error),
+            **doubts,
+            "effective_index": _effective_index(design, sensitivity, zones.angle),
             **aligned,
             "bad_pixels": int((~windows(valid, lattice, 0)[1]).sum()),
         },
     )
+
+
+def _effective_index(design: CameraDesign, sensitivity: np.ndarray, angle: np.ndarray) -> float:
+    """Return the effective index that explains best how the sensitivity, (A, M, K), shifts."""
+    level = sensitivity / sensitivity.mean((1, 2), keepdims=True)  # without vignetting
+    axis, *cones = (cone(design, one) for one in angle)
+    return fit_effective_index(level[0], level[1:], design.wavelength, cones, measured_in=axis)
 
 
 def _lit(light: np.ndarray, lattice: Lattice) -> np.ndarray:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from squilla.camera.design import CameraDesign
+from squilla.optics.angle import pupil_cone
 from squilla.optics.materials import refractive_index
 
 
@@ -132,20 +133,10 @@ def cone(design: CameraDesign, angle: float, rings: int = 4) -> tuple[np.ndarray
         rad; weights are cos^4 and sum to 1. Without the cone only the chief ray; without the
         field angle the pixel is taken to be on the axis.
     """
-    chief = np.tan(angle) if design.effects.field_angle else 0.0
-    if not design.effects.cone:
-        return np.array([np.arctan(chief)]), np.ones(1)
-    slope = design.lens.diameter / (2 * design.lens.focal_length)
-    x, y = [np.zeros(1)], [np.zeros(1)]
-    for ring in range(1, rings + 1):  # equal area for each point
-        turn = 2 * np.pi * np.arange(6 * ring) / (6 * ring)
-        radius = slope * np.sqrt(3 * ring**2 / (3 * rings * (rings + 1) + 1))
-        x.append(radius * np.cos(turn))
-        y.append(radius * np.sin(turn))
-    tangent = np.hypot(chief - np.concatenate(x), np.concatenate(y))
-    angles = np.arctan(tangent)
-    weights = np.cos(angles) ** 4
-    return angles, weights / weights.sum()
+    chief = angle if design.effects.field_angle else 0.0
+    lens = design.lens
+    f_number = lens.focal_length / lens.diameter if design.effects.cone else np.inf
+    return pupil_cone(chief, f_number, rings)
 
 
 def vignetting(
