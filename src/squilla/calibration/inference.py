@@ -36,7 +36,7 @@ class Inferred:
         draws of the error.
     power_error : (S,) relative error of the power of each step, as far as it shows.
     power_noise : their standard deviation.
-    noise : standard deviation of the rest at each of A, relative to the RMS of the sensitivity.
+    noise : standard deviation of the rest, relative to the RMS of the responses.
     evidence : logarithm of the probability of the responses; to compare models of the light with.
     """
 
@@ -44,7 +44,7 @@ class Inferred:
     deviations: np.ndarray
     power_error: np.ndarray
     power_noise: float
-    noise: np.ndarray
+    noise: float
     evidence: float
 
 
@@ -79,28 +79,21 @@ def infer_sensitivity(light: np.ndarray, response: np.ndarray, wavelength: np.nd
     if not unit > 0:
         raise InputError("The filters do not answer to the light: the frames are dark.")
     scaled = response / unit
-    settings = _most_probable(light, scaled.mean(1), wavelength)
-    fit = _Fit(light, scaled.mean(1), wavelength, settings)
+    fit = _Fit(light, scaled, wavelength, _most_probable(light, scaled, wavelength))
     error, covariance = fit.power_error()
+    smooth, root = fit.smoother()
+    corrected = scaled * (1 - error)[:, None, None]
 
     random = np.random.default_rng(0)
     common = random.multivariate_normal(np.zeros(len(light)), covariance, DRAWS, method="eigh")
-    own = random.standard_normal((DRAWS, response.shape[2], len(wavelength)))
-    sensitivity, deviations, noises = [], [], []
-    for zone in np.moveaxis(scaled, 1, 0):
-        corrected = zone * (1 - error)[:, None]
-        noise, smooth, root = fit.smoother(corrected)
-        sensitivity.append((smooth @ corrected).T)
-        # (J, S) times (S, M) for the errors of the power, and what the prior leaves open.
-        shared = np.einsum("ks,sm,js->jmk", smooth, zone, common, optimize=True)
-        deviations.append(shared + own @ root)
-        noises.append(noise)
+    own = random.standard_normal((DRAWS, 1, response.shape[2], len(wavelength))) @ root
+    shared = np.einsum("ks,sam,js->jamk", smooth, scaled, common, optimize=True)
     return Inferred(
-        unit * np.stack(sensitivity),
-        (unit * np.stack(deviations, 1)).astype(np.float32),
+        unit * np.einsum("ks,sam->amk", smooth, corrected),
+        (unit * (shared + own)).astype(np.float32),
         error,
-        float(np.exp(settings[3])),
-        np.array(noises),
+        fit.power_noise,
+        fit.noise,
         -fit.misfit,
     )
 
@@ -112,7 +105,7 @@ def _most_probable(light: np.ndarray, response: np.ndarray, wavelength: np.ndarr
     def misfit(settings: np.ndarray) -> float:
         inside = np.clip(settings, _LEAST, _MOST)
         beyond = float(np.square(settings - inside).sum())
-        return _Fit(light, response, wavelength, inside).misfit * (1 + 0 * beyond) + 100 * beyond
+        return _Fit(light, response, wavelength, inside).misfit + 100 * beyond
 
     start = np.log([0.08, 0.5, 1e-3, 0.01])
     simplex = start + np.vstack([np.zeros(4), np.diag([0.7, 0.7, -2.0, 1.0])])
@@ -122,38 +115,35 @@ def _most_probable(light: np.ndarray, response: np.ndarray, wavelength: np.ndarr
 
 
 class _Fit:
-    """The model of the responses of M filters, (S, M), under given settings."""
+    """The model of responses, (S, A, M), under given settings.
 
-    def __init__(self, light, response, wavelength, settings):
-        self.light = light
-        length, self.size, self.noise, self.power_noise = np.exp(settings)
-        self.settings = settings
+    The angles count as repetitions: what they say of the settings and the power is averaged.
+    """
+
+    def __init__(
+        self, light: np.ndarray, response: np.ndarray, wavelength: np.ndarray, settings: np.ndarray
+    ):
+        length, size, self.noise, self.power_noise = (float(each) for each in np.exp(settings))
+        steps, angles, filters = response.shape
         wavenumber = 1 / np.asarray(wavelength, float)
         apart = np.abs(wavenumber[:, None] - wavenumber) / np.ptp(wavenumber) / length
-        self.kernel = 1 + self.size**2 * _matern(apart)
+        alike = _matern(apart)
+        self.kernel = 1 + size**2 * alike
         self.seen = light @ self.kernel  # (S, K)
-        self.signal = self.seen @ light.T
-        filters = response.shape[1]
-        inverse, volume = self._inverse(self.noise)
+        covariance = self.seen @ light.T + self.noise**2 * np.eye(steps)
+        self.inverse = np.linalg.inv(covariance)
+        flat = response.reshape(steps, -1)
+        likelihood = self.inverse * (flat @ flat.T) / angles
         # The weights w = 1 / (1 + e), first with the shape that all filters share in them.
         share = light / light.sum(-1, keepdims=True).clip(1e-12)
-        self.shared = _SHARED**2 * (share @ (self.kernel - 1) @ share.T / self.size**2 + 1)
-        prior = self.shared + self.power_noise**2 * np.eye(len(light))
+        self.shared = _SHARED**2 * (1 + share @ alike @ share.T)
+        prior = self.shared + self.power_noise**2 * np.eye(steps)
         self.prior_inverse = np.linalg.inv(prior)
-        self.likelihood = inverse * (response @ response.T)
-        self.weight, hessian = _weights(self.likelihood, self.prior_inverse, filters)
-        self.hessian = hessian
+        self.weight, self.hessian = _weights(likelihood, self.prior_inverse, filters)
         off = self.weight - 1
-        self.misfit = float(
-            (self.weight @ self.likelihood @ self.weight + off @ self.prior_inverse @ off) / 2
-            - filters * np.log(self.weight).sum()
-            + (np.linalg.slogdet(hessian)[1] + np.linalg.slogdet(prior)[1] + filters * volume) / 2
-        )
-
-    def _inverse(self, noise: float) -> tuple[np.ndarray, float]:
-        """Return the inverse of the responses' covariance, and the logarithm of its determinant."""
-        covariance = self.signal + noise**2 * np.eye(len(self.signal))
-        return np.linalg.inv(covariance), float(np.linalg.slogdet(covariance)[1])
+        volume = filters * _volume(covariance) + _volume(self.hessian) + _volume(prior)
+        fit = self.weight @ likelihood @ self.weight + off @ self.prior_inverse @ off
+        self.misfit = float((fit + volume) / 2 - filters * np.log(self.weight).sum())
 
     def power_error(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the relative error of each step's power, (S,), and its covariance, (S, S).
@@ -167,25 +157,21 @@ class _Fit:
         explained = np.linalg.inv(prior + np.linalg.inv(precision))
         return error, variance * one - variance**2 * explained
 
-    def smoother(self, response: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return the noise of corrected responses (S, M), their smoother and what it leaves open.
+    def smoother(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return what turns responses into sensitivities, and what that leaves open.
 
-        noise : the standard deviation under which the responses are most probable.
         smooth : (K, S); a row of the sensitivity is ``smooth @ response``.
         root : (K, K); ``standard normal numbers @ root`` are draws of its error.
         """
-        best = None
-        for noise in 10.0 ** np.arange(-5, -0.9, 0.25):
-            inverse, volume = self._inverse(noise)
-            misfit = float((response * (inverse @ response)).sum()) + response.shape[1] * volume
-            if best is None or misfit < best[0]:
-                best = (misfit, noise, inverse)
-        assert best is not None
-        _, noise, inverse = best
-        smooth = self.seen.T @ inverse
+        smooth = self.seen.T @ self.inverse
         left = self.kernel - smooth @ self.seen
         values, vectors = np.linalg.eigh((left + left.T) / 2)
-        return noise, smooth, np.sqrt(values.clip(0))[:, None] * vectors.T
+        return smooth, np.sqrt(values.clip(0))[:, None] * vectors.T
+
+
+def _volume(covariance: np.ndarray) -> float:
+    """Return the logarithm of the determinant of a covariance."""
+    return float(np.linalg.slogdet(covariance)[1])
 
 
 def _matern(apart: np.ndarray) -> np.ndarray:
