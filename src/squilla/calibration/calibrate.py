@@ -1,6 +1,7 @@
 """The whole calibration: from frames of a camera to one `Calibration`."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,8 +9,10 @@ from squilla import __version__
 from squilla.calibration.alignment import windows
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.geometry import lattice_from_flat, refine_with_target
+from squilla.calibration.known import KnownScene, known_responses, sensitivity_from_spectra
 from squilla.calibration.pixels import Darks, Stack, defective, noise_of
 from squilla.calibration.sensitivity import (
+    Responses,
     SweepStep,
     Zones,
     sweep_responses,
@@ -27,7 +30,8 @@ def calibrate(
     *,
     dark: Iterable[Raw],
     flat: Iterable[Raw],
-    sweep: Iterable[SweepStep],
+    sweep: Iterable[SweepStep] | None = None,
+    known: Iterable[KnownScene] | None = None,
     target: Raw | None = None,
     target_distance: float | None = None,
 ) -> Calibration:
@@ -39,8 +43,10 @@ def calibrate(
         For what a maker knows: shape of the array, pitch, focal length, stop, band.
     dark, flat : iterable of Raw
         Several frames each, without light and of an evenly lit surface at about half scale.
-    sweep : iterable of SweepStep
+    sweep : iterable of SweepStep, optional
         Flat frames in narrow-band light over the whole band.
+    known : iterable of KnownScene, optional
+        Frames of surfaces of known spectra, instead of a sweep: a colour chart under several lamps.
     target : Raw, optional
         One frame of a textured plane facing the camera; refines the lattice lens by lens.
     target_distance : float, optional
@@ -55,6 +61,8 @@ def calibrate(
     InputError
         If the frames do not show what they should; the message names the frame.
     """
+    if (sweep is None) == (known is None):
+        raise InputError("Give either a narrow-band sweep or known scenes, to learn R from.")
     darks = Darks.of(dark)
     flats = Stack.of(flat, "flat")
     if darks.bias.shape != design.sensor_shape or flats.mean.shape != design.sensor_shape:
@@ -94,26 +102,59 @@ def calibrate(
 
     bias = np.where(lit, darks.bias, np.median(darks.bias)).astype(np.float32)
     dark_rate = np.where(lit, darks.rate, 0).astype(np.float32)
-    responses = sweep_responses(sweep, darks, relative, saturation, zones)
+    pixels = Pixels(bias, dark_rate, relative, valid, saturation, gain, read_noise)
+    if known is None:
+        assert sweep is not None
+        responses = sweep_responses(sweep, darks, relative, saturation, zones)
+        spectral = _from_sweep(responses, design, zones.angle)
+    else:
+        spectral = _from_known(known, design, lattice, pixels, float(zones.angle[-1]))
+    return replace(
+        spectral,
+        lattice=lattice,
+        pixels=pixels,
+        provenance={
+            "software": f"squilla {__version__}",
+            "design": design.name,
+            "camera": flats.camera,
+            **spectral.provenance,
+            **aligned,
+            "bad_pixels": int((~windows(valid, lattice, 0)[1]).sum()),
+        },
+    )
+
+
+def _from_sweep(responses: Responses, design: CameraDesign, angle: np.ndarray) -> Calibration:
+    """Return what a sweep teaches of the sensitivity at field angles (A,)."""
     found, doubts = sweep_sensitivity(responses, design.wavelength)
     sensitivity = np.maximum(found.sensitivity, 0)
     return Calibration(
         design.wavelength,
         sensitivity,
-        zones.angle,
-        lattice,
-        Pixels(bias, dark_rate, relative, valid, saturation, gain, read_noise),
-        found.deviations,
-        {
-            "software": f"squilla {__version__}",
-            "design": design.name,
-            "camera": flats.camera,
+        angle,
+        deviations=found.deviations,
+        provenance={
             "sweep_steps": len(found.power_error),
             **doubts,
-            "effective_index": _effective_index(design, sensitivity, zones.angle),
-            **aligned,
-            "bad_pixels": int((~windows(valid, lattice, 0)[1]).sum()),
+            "effective_index": _effective_index(design, sensitivity, angle),
         },
+    )
+
+
+def _from_known(
+    known: Iterable[KnownScene],
+    design: CameraDesign,
+    lattice: Lattice,
+    pixels: Pixels,
+    corner: float,
+) -> Calibration:
+    """Return what known scenes teach of the sensitivity, up to the corner's angle, rad."""
+    unknown = np.zeros((1, design.units, len(design.wavelength)))
+    blank = Calibration(design.wavelength, unknown, np.zeros(1), lattice, pixels)
+    measured, spectra, angle = known_responses(known, blank)
+    f_number = design.lens.focal_length / design.lens.diameter
+    return sensitivity_from_spectra(
+        measured, spectra, design.wavelength, angle=angle, f_number=f_number, corner=corner
     )
 
 

@@ -276,7 +276,9 @@ class Calibration:
         return replace(
             self,
             sensitivity=self.sensitivity @ shifts.swapaxes(-1, -2),
-            deviations=None if self.deviations is None else self.deviations @ shifts.swapaxes(-1, -2),
+            deviations=None
+            if self.deviations is None
+            else self.deviations @ shifts.swapaxes(-1, -2),
             angle=angle,
             provenance=self.provenance | {"effective_index": effective_index, "f_number": f_number},
         )

@@ -38,6 +38,8 @@ class Inferred:
     power_noise : their standard deviation.
     noise : standard deviation of the rest, relative to the RMS of the responses.
     evidence : logarithm of the probability of the responses; to compare models of the light with.
+    settings : (4,) logarithms of the correlation length, as a share of the band, of the size of R,
+        the noise and the power noise.
     """
 
     sensitivity: np.ndarray
@@ -46,9 +48,15 @@ class Inferred:
     power_noise: float
     noise: float
     evidence: float
+    settings: np.ndarray
 
 
-def infer_sensitivity(light: np.ndarray, response: np.ndarray, wavelength: np.ndarray) -> Inferred:
+def infer_sensitivity(
+    light: np.ndarray,
+    response: np.ndarray,
+    wavelength: np.ndarray,
+    settings: np.ndarray | None = None,
+) -> Inferred:
     """Infer the sensitivity from responses to light of known spectra.
 
     Parameters
@@ -59,6 +67,8 @@ def infer_sensitivity(light: np.ndarray, response: np.ndarray, wavelength: np.nd
         Of M filters at A field angles.
     wavelength : array, (K,)
         nm.
+    settings : array, (4,), optional
+        Those of an earlier inference, to compare evidence; default: the most probable.
 
     Returns
     -------
@@ -79,7 +89,9 @@ def infer_sensitivity(light: np.ndarray, response: np.ndarray, wavelength: np.nd
     if not unit > 0:
         raise InputError("The filters do not answer to the light: the frames are dark.")
     scaled = response / unit
-    fit = _Fit(light, scaled, wavelength, _most_probable(light, scaled, wavelength))
+    if settings is None:
+        settings = _most_probable(light, scaled, wavelength)
+    fit = _Fit(light, scaled, wavelength, settings)
     error, covariance = fit.power_error()
     smooth, root = fit.smoother()
     corrected = scaled * (1 - error)[:, None, None]
@@ -95,11 +107,12 @@ def infer_sensitivity(light: np.ndarray, response: np.ndarray, wavelength: np.nd
         fit.power_noise,
         fit.noise,
         -fit.misfit,
+        settings,
     )
 
 
 def _most_probable(light: np.ndarray, response: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
-    """Return the logarithms of correlation length, size, noise and power noise, (4,)."""
+    """Return the settings of `Inferred` under which the responses are most probable."""
     from scipy.optimize import minimize
 
     def misfit(settings: np.ndarray) -> float:

@@ -237,9 +237,7 @@ def sweep_sensitivity(sweep: Responses, grid: np.ndarray) -> tuple[Inferred, dic
     }
 
 
-def gaussian_bands(
-    wavelength: np.ndarray, bandwidth: np.ndarray, grid: np.ndarray
-) -> np.ndarray:
+def gaussian_bands(wavelength: np.ndarray, bandwidth: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Return the spectra of narrow-band lights on an even grid, (S, K), each with a sum of 1.
 
     Of a light that reaches beyond the grid only the part within is there.
