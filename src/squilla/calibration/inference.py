@@ -93,12 +93,12 @@ def infer_sensitivity(
         settings = _most_probable(light, scaled, wavelength)
     fit = _Fit(light, scaled, wavelength, settings)
     error, covariance = fit.power_error()
-    smooth, root = fit.smoother()
+    smooth, left = fit.smoother()
     corrected = scaled * (1 - error)[:, None, None]
 
     random = np.random.default_rng(0)
-    common = random.multivariate_normal(np.zeros(len(light)), covariance, DRAWS, method="eigh")
-    own = random.standard_normal((DRAWS, 1, response.shape[2], len(wavelength))) @ root
+    common = random.standard_normal((DRAWS, len(light))) @ _root(covariance)
+    own = random.standard_normal((DRAWS, 1, response.shape[2], len(wavelength))) @ _root(left)
     shared = np.einsum("ks,sam,js->jamk", smooth, scaled, common, optimize=True)
     return Inferred(
         unit * np.einsum("ks,sam->amk", smooth, corrected),
@@ -174,12 +174,16 @@ class _Fit:
         """Return what turns responses into sensitivities, and what that leaves open.
 
         smooth : (K, S); a row of the sensitivity is ``smooth @ response``.
-        root : (K, K); ``standard normal numbers @ root`` are draws of its error.
+        left : (K, K); the covariance of its error.
         """
         smooth = self.seen.T @ self.inverse
-        left = self.kernel - smooth @ self.seen
-        values, vectors = np.linalg.eigh((left + left.T) / 2)
-        return smooth, np.sqrt(values.clip(0))[:, None] * vectors.T
+        return smooth, self.kernel - smooth @ self.seen
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """Return what standard normal numbers, (.., S), are multiplied by to have a covariance."""
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    return np.sqrt(values.clip(0))[:, None] * vectors.T
 
 
 def _volume(covariance: np.ndarray) -> float:

@@ -1,5 +1,6 @@
 """The sensitivity without a monochromator: from surfaces and lamps whose spectra are known."""
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -14,8 +15,8 @@ from squilla.errors import InputError
 from squilla.files.raw import Raw
 from squilla.optics.angle import blue_shift, pupil_cone
 
-_BORDER = 8
-"""Pixels beside the border of a surface that are left out: blur reaches so far."""
+_BORDER = 20.0
+"""Strip along the border of a surface that is left out, um on the sensor: blur reaches so far."""
 
 _INDICES = (1.5, 1.75, 2.1)
 """Effective indices whose evidence a parabola is laid through."""
@@ -77,19 +78,20 @@ def known_responses(
                 "must agree with them."
             )
         measurement = measure(scene.raw, calibration, distance=scene.distance)
-        size = 2 * _BORDER + 1
+        size = 2 * math.ceil(_BORDER / lattice.pixel) + 1
         inside = minimum_filter(scene.labels, size) == maximum_filter(scene.labels, size)
         for surface in range(kinds):
             chosen = torch.from_numpy(inside & (scene.labels == surface))
             y, valid = measurement.y[chosen].double(), measurement.valid[chosen]
-            if valid.sum(0).min(initial=0) < 9:
+            if int(valid.sum(0).min()) < 9:
                 continue
             measured.append(((y * valid).sum(0) / valid.sum(0)).numpy())
             spectra.append(scene.spectra[surface])
             angles.append(float(measurement.angle[chosen].square().mean().sqrt()))
     if not measured:
         raise InputError(
-            f"No known surface is larger than {2 * _BORDER + 3} px; show fewer and larger ones."
+            "No known surface is large enough to be measured without its blurred border; show fewer "
+            "and larger ones."
         )
     return np.stack(measured), np.stack(spectra), np.array(angles)
 

@@ -14,6 +14,9 @@ from squilla.files.raw import Raw
 
 Window = tuple[slice, slice]
 
+_OUTSIDE = 1e-3
+"""Share of its light within the band below which a step lies outside."""
+
 
 @dataclass(frozen=True)
 class SweepStep:
@@ -216,10 +219,10 @@ def sweep_sensitivity(sweep: Responses, grid: np.ndarray) -> tuple[Inferred, dic
     """
     light = gaussian_bands(sweep.wavelength, sweep.bandwidth, grid)
     response, drift = _without_drift(sweep)
-    outside = light.sum(-1) < 1e-3
+    outside = light.sum(-1) < _OUTSIDE
     stray = None
     if outside.any() and not outside.all():
-        response, stray = _without_stray_light(sweep.wavelength, response, outside)
+        response, stray = _without_stray_light(sweep.wavelength, response, light.sum(-1))
     middle, light, response = sweep.wavelength[~outside], light[~outside], response[~outside]
     _check_cover(middle, grid)
     found = infer_sensitivity(light, response, grid)
@@ -263,15 +266,17 @@ def _without_drift(sweep: Responses) -> tuple[np.ndarray, float | None]:
 
 
 def _without_stray_light(
-    wavelength: np.ndarray, response: np.ndarray, outside: np.ndarray
+    wavelength: np.ndarray, response: np.ndarray, within: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Return responses without the part that steps outside the band show, and its share.
 
-    Stray light is taken to be even over the band.
+    Stray light is taken to be even over the band; `within` is the share, (S,), of each step's light
+    that lies in the band.
     """
-    order = np.argsort(wavelength[~outside], kind="stable")
-    middle, inside = wavelength[~outside][order], response[~outside][order]
-    white = np.average(inside, axis=0, weights=np.gradient(middle))
+    outside, inside = within < _OUTSIDE, np.flatnonzero(within > 0.3)
+    inside = inside[np.argsort(wavelength[inside], kind="stable")]
+    width = np.gradient(wavelength[inside])
+    white = np.average(response[inside] / within[inside, None, None], axis=0, weights=width)
     share = float((response[outside] * white).sum() / (outside.sum() * (white**2).sum()))
     if share > 0.05:
         raise InputError(

@@ -178,7 +178,8 @@ class _Run:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.optimiser.zero_grad()
-        loss = nn.functional.mse_loss(self.model.estimate(y, angle), x)
+        estimate = self.model.estimate(self.model.levelled(y, angle), angle)
+        loss = nn.functional.mse_loss(estimate, x)
         loss.backward()
         self.optimiser.step()
         return loss.detach() * len(x)
@@ -193,7 +194,8 @@ class _Run:
     @torch.inference_mode()
     def _validate(self) -> float:
         total = sum(
-            float((self.model.estimate(y, angle) - x).square().mean()) * len(x)
+            float((self.model.estimate(self.model.levelled(y, angle), angle) - x).square().mean())
+            * len(x)
             for y, angle, x in self.validation
         )
         return total / VALIDATION
