@@ -204,7 +204,7 @@ def frames(camera: squilla.Camera, learnt: Calibration) -> dict:
 
 
 def tiles(camera: squilla.Camera):
-    """Return a scene of 25 px tiles, natural spectra, the same set in the middle and the corners."""
+    """Return a scene of 25 px tiles of natural spectra, the same in the middle and the corners."""
     scene = load_scene("chart", camera.design.wavelength, 350)
     pick = PRIORS["natural"](
         25, camera.design.wavelength, generator=torch.Generator().manual_seed(8)

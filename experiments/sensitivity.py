@@ -1,12 +1,12 @@
-"""How well the sensitivity is learnt: from sweeps with all their faults, and from a chart and lamps.
+"""How well R is learnt: from sweeps with all their faults, and from a chart and lamps.
 
     python experiments/sensitivity.py [FOLDER]
 
 The twin of the thesis' camera, 3000 x 4000 px, takes the frames of each case (those marked * with
 pixels of twice the size, to save time); a calibration is learnt from them and kept in FOLDER
-(default: build/sensitivity), so that an interrupted run goes on. Then every calibration is judged: its error against the truth, how honest its own uncertainty
-is, and what spectra cost that are reconstructed with it. Writes experiments/results/sensitivity.json
-and prints the tables.
+(default: build/sensitivity), so that an interrupted run goes on. Then each calibration is judged:
+its error against the truth, how honest its own uncertainty is, and what spectra cost that are
+reconstructed with it. Writes experiments/results/sensitivity.json and prints the tables.
 """
 
 import json
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 import squilla
-from squilla.calibration.rehearsal import Rehearsal
+from squilla.calibration.rehearsal import LAMPS, Rehearsal
 from squilla.reconstruction.reconstructor import load_model
 from squilla.spectra import CHART_LIGHT, chart_reflectances, lights, natural_spectra
 from squilla.training.noise import add_noise
@@ -27,7 +27,6 @@ from squilla.training.noise import add_noise
 RESULTS = Path(__file__).parent / "results" / "sensitivity.json"
 SWEEP = {"step": 5.0, "bandwidth": 5.0, "power_error": 0.01}
 MISSING = (17, 34)
-WHITE = ("A", "FL11", "LED-B1", "LED-B5", "D65")
 LEDS = ((505, 28), (525, 32), (560, 30), (590, 16), (617, 18), (635, 17), (660, 20), (690, 22),
         (735, 28))  # nm: centre and width, as catalogues have them  # fmt: skip
 MODELS = ("ridge", "sparse")
@@ -40,7 +39,7 @@ def main() -> None:
     coarse = squilla.Camera(halved(full.design))
     results = {"machine": platform.processor() or platform.machine(), "cases": {}}
     for name, case in CASES.items():
-        path = folder / f"{name.replace('*', '')}.nc"
+        path = folder / f"{name.removesuffix(' *')}.nc"
         camera = coarse if "*" in name else full
         if not path.exists():
             print(f"{name}: taking frames", flush=True)
@@ -102,9 +101,9 @@ def spoilt(steps, camera):
 
 CASES = {
     "sweep, 5 nm steps": (SWEEP, plain),
-    "sweep, 2.5 nm steps": (SWEEP | {"step": 2.5}, plain),
-    "chart and white lamps": ({"power_error": 0.01}, False),
-    "chart, white lamps and LEDs": ({"power_error": 0.01}, True),
+    "sweep, 2.5 nm steps *": (SWEEP | {"step": 2.5}, plain),
+    "chart and white lamps *": ({"power_error": 0.01}, False),
+    "chart, white lamps and LEDs *": ({"power_error": 0.01}, True),
     "exact power *": (SWEEP | {"power_error": 0.0}, plain),
     "uneven steps *": (SWEEP, uneven),
     "saturated and misread step *": (SWEEP, plain),
@@ -129,7 +128,7 @@ def learn(camera: squilla.Camera, case) -> squilla.Calibration:
             lessons["sweep"] = spoilt(lessons["sweep"], camera)
     else:
         wavelength, table = camera.design.wavelength, lights()
-        lamps = [table.on(wavelength)[table.name.index(name)] for name in WHITE]
+        lamps = [table.on(wavelength)[table.name.index(name)] for name in LAMPS]
         if change:
             lamps += [np.exp(-4 * np.log(2) * ((wavelength - c) / w) ** 2) for c, w in LEDS]
         lessons["known"] = rehearsal.known(np.array(lamps))
@@ -199,7 +198,7 @@ def costs(calibration: squilla.Calibration, truth: np.ndarray) -> dict:
 
 def table(cases: dict) -> str:
     lines = [
-        "| | error of R | worst filter | but a common factor | own uncertainty | normalised error |",
+        "| | error of R | worst filter | but a common factor | own uncertainty | normalised |",
         "|---|---|---|---|---|---|",
     ]
     for name, case in cases.items():

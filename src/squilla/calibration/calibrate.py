@@ -151,10 +151,15 @@ def _from_known(
     """Return what known scenes teach of the sensitivity, up to the corner's angle, rad."""
     unknown = np.zeros((1, design.units, len(design.wavelength)))
     blank = Calibration(design.wavelength, unknown, np.zeros(1), lattice, pixels)
-    measured, spectra, angle = known_responses(known, blank)
-    f_number = design.lens.focal_length / design.lens.diameter
+    measured, spectra, angle, snr = known_responses(known, blank)
     return sensitivity_from_spectra(
-        measured, spectra, design.wavelength, angle=angle, f_number=f_number, corner=corner
+        measured,
+        spectra,
+        design.wavelength,
+        angle=angle,
+        snr=snr,
+        f_number=design.lens.focal_length / design.lens.diameter,
+        corner=corner,
     )
 
 

@@ -13,6 +13,7 @@ found and taken out; what varies slowly is a light brighter there or filters mor
 and no sweep can tell.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +23,12 @@ from squilla.errors import InputError
 DRAWS = 24
 """Number of draws that stand for what is left open."""
 
-_LEAST = np.log([2e-3, 0.02, 1e-5, 1e-5])
+_LEAST = np.log([2e-3, 0.02, 1e-3, 1e-5])
 _MOST = np.log([2.0, 5.0, 0.3, 0.3])
-_SHARED = 0.3  # share of R, RMS, in a spectral shape that all filters have, such as the sensor's
+"""Bounds of the settings of `Inferred`. A noise below 0.1 % is not believed: the finest wiggles of
+real filters follow no simple model that closely."""
+_SHARED = 0.3
+"""What all filters have in common, such as the sensor's efficiency, varies by this much of R."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class Inferred:
         draws of the error.
     power_error : (S,) relative error of the power of each step, as far as it shows.
     power_noise : their standard deviation.
-    noise : standard deviation of the rest, relative to the RMS of the responses.
+    noise : (median) standard deviation of the rest, relative to the RMS of the responses.
     evidence : logarithm of the probability of the responses; to compare models of the light with.
     settings : (4,) logarithms of the correlation length, as a share of the band, of the size of R,
         the noise and the power noise.
@@ -55,6 +59,8 @@ def infer_sensitivity(
     light: np.ndarray,
     response: np.ndarray,
     wavelength: np.ndarray,
+    *,
+    spread: np.ndarray | None = None,
     settings: np.ndarray | None = None,
 ) -> Inferred:
     """Infer the sensitivity from responses to light of known spectra.
@@ -67,6 +73,8 @@ def infer_sensitivity(
         Of M filters at A field angles.
     wavelength : array, (K,)
         nm.
+    spread : array, (S,), optional
+        Standard deviation of the noise of each step's responses, in any unit; default: all alike.
     settings : array, (4,), optional
         Those of an earlier inference, to compare evidence; default: the most probable.
 
@@ -89,9 +97,10 @@ def infer_sensitivity(
     if not unit > 0:
         raise InputError("The filters do not answer to the light: the frames are dark.")
     scaled = response / unit
+    variance = np.ones(len(light)) if spread is None else np.square(spread / np.median(spread))
     if settings is None:
-        settings = _most_probable(light, scaled, wavelength)
-    fit = _Fit(light, scaled, wavelength, settings)
+        settings = _most_probable(light, scaled, wavelength, variance)
+    fit = _Fit(light, scaled, wavelength, variance, settings)
     error, covariance = fit.power_error()
     smooth, left = fit.smoother()
     corrected = scaled * (1 - error)[:, None, None]
@@ -111,20 +120,47 @@ def infer_sensitivity(
     )
 
 
-def _most_probable(light: np.ndarray, response: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
-    """Return the settings of `Inferred` under which the responses are most probable."""
-    from scipy.optimize import minimize
+def _most_probable(
+    light: np.ndarray, response: np.ndarray, wavelength: np.ndarray, variance: np.ndarray
+) -> np.ndarray:
+    """Return the settings of `Inferred` under which the responses are most probable.
 
-    def misfit(settings: np.ndarray) -> float:
-        inside = np.clip(settings, _LEAST, _MOST)
-        beyond = float(np.square(settings - inside).sum())
-        return _Fit(light, response, wavelength, inside).misfit + 100 * beyond
+    Length and size first, with errors of the power as if each filter had its own: what is known to
+    a percent tells how smooth filters are on the whole. Known to a thousandth, it would rather tell
+    how no simple model of a filter is right, and lay that on the power.
+    """
+    steps, angles, filters = response.shape
+    flat = response.reshape(steps, -1)
+    moment = flat @ flat.T / angles
+
+    def apart(settings: np.ndarray) -> float:
+        length, size, noise, power_noise = np.exp(settings)
+        covariance = light @ _kernel(wavelength, length, size) @ light.T
+        error = noise**2 * variance + power_noise**2 * np.diag(moment) / filters
+        covariance += np.diag(error)
+        return float((np.linalg.inv(covariance) * moment).sum() + filters * _volume(covariance)) / 2
+
+    def together(noises: np.ndarray) -> float:
+        return _Fit(light, response, wavelength, variance, np.r_[shape, noises]).misfit
 
     start = np.log([0.08, 0.5, 1e-3, 0.01])
-    simplex = start + np.vstack([np.zeros(4), np.diag([0.7, 0.7, -2.0, 1.0])])
+    shape = _least(apart, start, _LEAST, _MOST)[:2]
+    return np.r_[shape, _least(together, start[2:], _LEAST[2:], _MOST[2:])]
+
+
+def _least(
+    function: Callable[[np.ndarray], float], start: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Return where a function of a few variables is least between bounds."""
+    from scipy.optimize import minimize
+
+    def bounded(place: np.ndarray) -> float:
+        inside = np.clip(place, low, high)
+        return function(inside) + 100 * float(np.square(place - inside).sum())
+
+    simplex = start + np.vstack([np.zeros(len(start)), 0.8 * np.eye(len(start))])
     options = {"initial_simplex": simplex, "xatol": 0.03, "fatol": 0.3, "maxiter": 250}
-    found = minimize(misfit, start, method="Nelder-Mead", options=options)
-    return np.clip(found.x, _LEAST, _MOST)
+    return np.clip(minimize(bounded, start, method="Nelder-Mead", options=options).x, low, high)
 
 
 class _Fit:
@@ -134,22 +170,24 @@ class _Fit:
     """
 
     def __init__(
-        self, light: np.ndarray, response: np.ndarray, wavelength: np.ndarray, settings: np.ndarray
+        self,
+        light: np.ndarray,
+        response: np.ndarray,
+        wavelength: np.ndarray,
+        variance: np.ndarray,
+        settings: np.ndarray,
     ):
         length, size, self.noise, self.power_noise = (float(each) for each in np.exp(settings))
         steps, angles, filters = response.shape
-        wavenumber = 1 / np.asarray(wavelength, float)
-        apart = np.abs(wavenumber[:, None] - wavenumber) / np.ptp(wavenumber) / length
-        alike = _matern(apart)
-        self.kernel = 1 + size**2 * alike
+        self.kernel = _kernel(wavelength, length, size)
         self.seen = light @ self.kernel  # (S, K)
-        covariance = self.seen @ light.T + self.noise**2 * np.eye(steps)
+        covariance = self.seen @ light.T + self.noise**2 * np.diag(variance)
         self.inverse = np.linalg.inv(covariance)
         flat = response.reshape(steps, -1)
         likelihood = self.inverse * (flat @ flat.T) / angles
         # The weights w = 1 / (1 + e), first with the shape that all filters share in them.
         share = light / light.sum(-1, keepdims=True).clip(1e-12)
-        self.shared = _SHARED**2 * (1 + share @ alike @ share.T)
+        self.shared = share @ _kernel(wavelength, length, _SHARED) @ share.T
         prior = self.shared + self.power_noise**2 * np.eye(steps)
         self.prior_inverse = np.linalg.inv(prior)
         self.weight, self.hessian = _weights(likelihood, self.prior_inverse, filters)
@@ -191,10 +229,12 @@ def _volume(covariance: np.ndarray) -> float:
     return float(np.linalg.slogdet(covariance)[1])
 
 
-def _matern(apart: np.ndarray) -> np.ndarray:
-    """Return Matern's correlation of order 7/2 at distances in correlation lengths."""
-    x = np.sqrt(7) * apart
-    return (1 + x * (1 + x * (0.4 + x / 15))) * np.exp(-x)
+def _kernel(wavelength: np.ndarray, length: float, size: float) -> np.ndarray:
+    """Return the covariance of a smooth row of R, (K, K): a level of 1 and Matern's of order 7/2."""
+    wavenumber = 1 / np.asarray(wavelength, float)
+    apart = np.abs(wavenumber[:, None] - wavenumber) / np.ptp(wavenumber)
+    x = np.sqrt(7) / length * apart
+    return 1 + size**2 * (1 + x * (1 + x * (0.4 + x / 15))) * np.exp(-x)
 
 
 def _weights(

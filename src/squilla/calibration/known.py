@@ -42,7 +42,7 @@ class KnownScene:
 
 def known_responses(
     scenes: Iterable[KnownScene], calibration: Calibration
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Reduce frames of known surfaces, one by one, to their mean measurements.
 
     Parameters
@@ -56,13 +56,14 @@ def known_responses(
     measured : array, (N, M), DN per ms
     spectra : array, (N, K)
     angle : array, (N,), rad
+    snr : array, (N,), dB
 
     Raises
     ------
     InputError
         If shapes do not fit or no surface is large enough.
     """
-    measured, spectra, angles = [], [], []
+    measured, spectra, angles, snr = [], [], [], []
     for number, scene in enumerate(scenes, 1):
         kinds, bands = np.shape(scene.spectra)
         lattice = calibration.lattice
@@ -88,12 +89,15 @@ def known_responses(
             measured.append(((y * valid).sum(0) / valid.sum(0)).numpy())
             spectra.append(scene.spectra[surface])
             angles.append(float(measurement.angle[chosen].square().mean().sqrt()))
+            assert measurement.snr is not None
+            of_pixel = float(measurement.snr[chosen].mean())
+            snr.append(of_pixel + 10 * math.log10(int(chosen.sum())))
     if not measured:
         raise InputError(
-            "No known surface is large enough to be measured without its blurred border; show fewer "
-            "and larger ones."
+            "No known surface is large enough to be measured without its blurred border; show "
+            "fewer and larger ones."
         )
-    return np.stack(measured), np.stack(spectra), np.array(angles)
+    return np.stack(measured), np.stack(spectra), np.array(angles), np.array(snr)
 
 
 def sensitivity_from_spectra(
@@ -102,6 +106,7 @@ def sensitivity_from_spectra(
     wavelength: np.ndarray,
     *,
     angle: np.ndarray | None = None,
+    snr: np.ndarray | None = None,
     f_number: float = np.inf,
     effective_index: float | None = None,
     corner: float | None = None,
@@ -121,6 +126,8 @@ def sensitivity_from_spectra(
         nm, increasing.
     angle : array, (N,), optional
         Field angle at which each was seen, rad; without it all are seen alike.
+    snr : array, (N,), optional
+        Signal-to-noise ratio of each measurement, dB; default: as noisy relative to its light.
     f_number : float
         Of the lens, which gives the cone of light on a filter; infinite for a parallel beam.
     effective_index : float, optional
@@ -151,10 +158,12 @@ def sensitivity_from_spectra(
     level = spectra.sum(-1, keepdims=True)
     if not level.min() > 0:
         raise InputError("A known spectrum is dark; leave it out.")
-    # Bright and dark surfaces were exposed alike: what is even is their relative noise.
     response, light = (measured / level)[:, None], spectra / level
+    spread = np.ones(count) if snr is None else 10 ** (-np.asarray(snr, float) / 20)
+    if spread.shape != (count,) or not np.isfinite(spread).all():
+        raise InputError(f"{spread.shape} SNRs were given for {count} measurements.")
     if angle is None:
-        found = infer_sensitivity(light, response, wavelength)
+        found = infer_sensitivity(light, response, wavelength, spread=spread)
         index = None
     else:
         angle = np.asarray(angle, float)
@@ -166,8 +175,8 @@ def sensitivity_from_spectra(
 
         index = effective_index
         if index is None:
-            index = _effective_index(seen, response, wavelength)
-        found = infer_sensitivity(seen(index), response, wavelength)
+            index = _effective_index(seen, response, wavelength, spread)
+        found = infer_sensitivity(seen(index), response, wavelength, spread=spread)
     one = Calibration(
         wavelength,
         np.maximum(found.sensitivity, 0),
@@ -194,14 +203,17 @@ def _on_axis(
 
 
 def _effective_index(
-    seen: Callable[[float], np.ndarray], response: np.ndarray, wavelength: np.ndarray
+    seen: Callable[[float], np.ndarray],
+    response: np.ndarray,
+    wavelength: np.ndarray,
+    spread: np.ndarray,
 ) -> float:
     """Return the effective index under which the responses are most probable."""
     inverse_square = np.array(_INDICES) ** -2.0  # in which the shift is linear
-    middle = infer_sensitivity(seen(_INDICES[1]), response, wavelength)
+    given = {"spread": spread}
+    given["settings"] = infer_sensitivity(seen(_INDICES[1]), response, wavelength, **given).settings
     evidence = [
-        infer_sensitivity(seen(index), response, wavelength, middle.settings).evidence
-        for index in _INDICES
+        infer_sensitivity(seen(index), response, wavelength, **given).evidence for index in _INDICES
     ]
     curve, slope, _ = np.polyfit(inverse_square, evidence, 2)
     if not curve < 0:

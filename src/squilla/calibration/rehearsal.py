@@ -15,7 +15,10 @@ from squilla.camera.scenes import chart_layout
 from squilla.camera.twin import Camera
 from squilla.files.cube import labelled
 from squilla.files.raw import Raw
-from squilla.spectra import reflectances
+from squilla.spectra import lights, reflectances
+
+LAMPS = ("A", "FL11", "LED-B1", "LED-B5", "D65")
+"""White lamps of `squilla.spectra.lights` under which the chart of `Rehearsal.known` is shown."""
 
 
 class Rehearsal:
@@ -102,21 +105,24 @@ class Rehearsal:
             error = self.power_error * float(torch.randn(1, generator=generator))
             yield SweepStep(raw, float(wavelength), 1.0 + error, self.bandwidth)
 
-    def known(self, lamps: np.ndarray) -> Iterator[KnownScene]:
+    def known(self, lamps: np.ndarray | None = None) -> Iterator[KnownScene]:
         """Yield frames of a chart of 24 matte surfaces under each of some lamps.
 
         The surfaces are from the Esser chart in `squilla.spectra.reflectances`.
 
         Parameters
         ----------
-        lamps : array, (lamps, K)
-            Photon radiance of white in their light.
+        lamps : array, (lamps, K), optional
+            Photon radiance of white in their light; default: `LAMPS`.
         """
         size, wavelength = self.camera.design.field.size, self.camera.design.wavelength
         table, labels = reflectances(), chart_layout(size, size)
         chart = [number for number, name in enumerate(table.name) if name.startswith("esser")]
         chart = np.array(chart)[np.linspace(0, len(chart) - 1, 24).astype(int)]
         surface = np.vstack([table.on(wavelength)[chart], np.full(len(wavelength), 0.03)])
+        if lamps is None:
+            names = [lights().name.index(name) for name in LAMPS]
+            lamps = lights().on(wavelength)[names]
         for number, lamp in enumerate(lamps):
             generator = self._generator(7, number)
             scene = labelled((surface * lamp).astype(np.float32)[labels], wavelength)

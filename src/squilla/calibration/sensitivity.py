@@ -227,8 +227,13 @@ def sweep_sensitivity(sweep: Responses, grid: np.ndarray) -> tuple[Inferred, dic
     _check_cover(middle, grid)
     found = infer_sensitivity(light, response, grid)
     size = np.abs(found.power_error)
-    doubted = size > max(0.03, 8 * float(np.median(size)))
-    if 0 < doubted.sum() <= max(2, 0.1 * len(doubted)):
+    doubted = size > max(0.05, 10 * float(np.median(size)))
+    if doubted.sum() > max(2, 0.1 * len(doubted)):
+        raise InputError(
+            f"{doubted.sum()} steps of the sweep contradict the others, that at "
+            f"{middle[doubted][0]:g} nm for one, in all filters at once; check their powers."
+        )
+    if doubted.any():
         _check_cover(middle[~doubted], grid)
         found = infer_sensitivity(light[~doubted], response[~doubted], grid)
     return found, {
