@@ -15,7 +15,6 @@ from squilla.calibration.geometry import find_windows
 from squilla.calibration.pixels import Darks, Stack, noise_of
 from squilla.calibration.rehearsal import Rehearsal, poster
 from squilla.calibration.resample import SINC, sinc_kernel
-from squilla.calibration.sensitivity import unfold
 from squilla.calibration.store import load_calibration
 from squilla.camera.design import CameraDesign, Effects
 from squilla.camera.twin import Camera
@@ -291,20 +290,6 @@ def test_frames_of_another_camera_are_refused(camera, calibration, scene):
     plain = Calibration.from_sensitivity(np.ones((16, 3)), np.array([500.0, 600.0, 700.0]))
     with pytest.raises(InputError, match="no camera geometry"):
         measure(raw, plain)
-
-
-@pytest.mark.parametrize("bandwidth", [2.0, 5.0, 8.0])
-def test_unfolding_undoes_the_bandwidth(bandwidth):
-    """Gaussian features convolve to Gaussians of known width and height."""
-    grid = np.linspace(500, 750, 251)
-    width, sigma = 14.0, bandwidth / 2.3548
-    steps = np.arange(500, 751, 4.0)
-    wide = np.hypot(width, sigma)
-    centres = np.array([560.0, 625.0, 690.0])
-    measured = width / wide * np.exp(-((steps[:, None] - centres) ** 2) / 2 / wide**2)
-    found = unfold(steps, np.full(len(steps), bandwidth), measured, grid)
-    truth = np.exp(-((grid - centres[:, None]) ** 2) / 2 / width**2)
-    assert rms(found - truth) / rms(truth) < 0.01
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The whole calibration: from frames of a camera to one `Calibration`."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,12 +9,21 @@ from squilla import __version__
 from squilla.calibration.alignment import windows
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.geometry import lattice_from_flat, refine_with_target
+from squilla.calibration.known import KnownScene, known_responses, sensitivity_from_spectra
 from squilla.calibration.pixels import Darks, Stack, defective, noise_of
-from squilla.calibration.sensitivity import SweepStep, Zones, sweep_responses, unfold
+from squilla.calibration.sensitivity import (
+    Responses,
+    SweepStep,
+    Zones,
+    sweep_responses,
+    sweep_sensitivity,
+)
 from squilla.calibration.stray import stray_light
 from squilla.camera.design import CameraDesign
+from squilla.camera.lens import cone
 from squilla.errors import InputError
 from squilla.files.raw import Raw
+from squilla.optics.angle import fit_effective_index
 
 
 def calibrate(
@@ -21,7 +31,8 @@ def calibrate(
     *,
     dark: Iterable[Raw],
     flat: Iterable[Raw],
-    sweep: Iterable[SweepStep],
+    sweep: Iterable[SweepStep] | None = None,
+    known: Iterable[KnownScene] | None = None,
     target: Raw | None = None,
     target_distance: float | None = None,
 ) -> Calibration:
@@ -33,8 +44,10 @@ def calibrate(
         For what a maker knows: shape of the array, pitch, focal length, stop, band.
     dark, flat : iterable of Raw
         Several frames each, without light and of an evenly lit surface at about half scale.
-    sweep : iterable of SweepStep
+    sweep : iterable of SweepStep, optional
         Flat frames in narrow-band light over the whole band.
+    known : iterable of KnownScene, optional
+        Frames of surfaces of known spectra, instead of a sweep: a colour chart under several lamps.
     target : Raw, optional
         One frame of a textured plane facing the camera; refines the lattice lens by lens.
     target_distance : float, optional
@@ -54,6 +67,8 @@ def calibrate(
             f"The filters of {design.name!r} are in a {design.filters.layout} layout; only cameras "
             "with a lens array are calibrated from frames."
         )
+    if (sweep is None) == (known is None):
+        raise InputError("Give either a narrow-band sweep or known scenes, to learn R from.")
     darks = Darks.of(dark)
     flats = Stack.of(flat, "flat")
     if darks.bias.shape != design.sensor_shape or flats.mean.shape != design.sensor_shape:
@@ -93,26 +108,74 @@ def calibrate(
 
     bias = np.where(lit, darks.bias, np.median(darks.bias)).astype(np.float32)
     dark_rate = np.where(lit, darks.rate, np.median(darks.rate)).astype(np.float32)
-    wavelength, bandwidth, response = sweep_responses(sweep, darks, relative, saturation, zones)
-    sensitivity = np.maximum(unfold(wavelength, bandwidth, response, design.wavelength), 0)
     pixels = Pixels(bias, dark_rate, relative, valid, saturation, gain, read_noise)
+    if known is None:
+        assert sweep is not None
+        responses = sweep_responses(sweep, darks, relative, saturation, zones)
+        spectral = _from_sweep(responses, design, zones.angle)
+    else:
+        spectral = _from_known(known, design, lattice, pixels, float(zones.angle[-1]))
     signal = float(windows(light, lattice, 0)[1].mean())
-    return Calibration(
-        design.wavelength,
-        sensitivity,
-        zones.angle,
-        lattice,
-        pixels,
-        {
+    return replace(
+        spectral,
+        lattice=lattice,
+        pixels=pixels,
+        provenance={
             "software": f"squilla {__version__}",
             "design": design.name,
             "camera": flats.camera,
-            "sweep_steps": len(wavelength),
+            **spectral.provenance,
             **aligned,
             **stray_light(flats.mean, flats.exposure, pixels, signal),
             "bad_pixels": int((~windows(valid, lattice, 0)[1]).sum()),
         },
     )
+
+
+def _from_sweep(responses: Responses, design: CameraDesign, angle: np.ndarray) -> Calibration:
+    """Return what a sweep teaches of the sensitivity at field angles (A,)."""
+    found, doubts = sweep_sensitivity(responses, design.wavelength)
+    sensitivity = np.maximum(found.sensitivity, 0)
+    return Calibration(
+        design.wavelength,
+        sensitivity,
+        angle,
+        deviations=found.deviations,
+        provenance={
+            "sweep_steps": len(found.power_error),
+            **doubts,
+            "effective_index": _effective_index(design, sensitivity, angle),
+        },
+    )
+
+
+def _from_known(
+    known: Iterable[KnownScene],
+    design: CameraDesign,
+    lattice: Lattice,
+    pixels: Pixels,
+    corner: float,
+) -> Calibration:
+    """Return what known scenes teach of the sensitivity, up to the corner's angle, rad."""
+    unknown = np.zeros((1, design.units, len(design.wavelength)))
+    blank = Calibration(design.wavelength, unknown, np.zeros(1), lattice, pixels)
+    measured, spectra, angle, snr = known_responses(known, blank)
+    return sensitivity_from_spectra(
+        measured,
+        spectra,
+        design.wavelength,
+        angle=angle,
+        snr=snr,
+        f_number=design.lens.focal_length / design.lens.diameter,
+        corner=corner,
+    )
+
+
+def _effective_index(design: CameraDesign, sensitivity: np.ndarray, angle: np.ndarray) -> float:
+    """Return the effective index that explains best how the sensitivity, (A, M, K), shifts."""
+    level = sensitivity / sensitivity.mean((1, 2), keepdims=True)  # without vignetting
+    axis, *cones = (cone(design, one) for one in angle)
+    return fit_effective_index(level[0], level[1:], design.wavelength, cones, measured_in=axis)
 
 
 def _lit(light: np.ndarray, lattice: Lattice) -> np.ndarray:

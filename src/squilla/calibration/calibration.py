@@ -122,6 +122,8 @@ class Calibration:
         for a matrix of one's own; one matrix for each field angle in `angle`.
     angle : (A,) rad, increasing.
     lattice, pixels : None when only a response matrix is known.
+    deviations : (J, A, M, K) draws of the sensitivity's error, in its unit: sensitivity +
+        deviations[j] explains the calibration's frames as well. None where nothing is known of it.
     provenance : what it was made from; plain numbers and strings.
     """
 
@@ -130,6 +132,7 @@ class Calibration:
     angle: np.ndarray
     lattice: Lattice | None = None
     pixels: Pixels | None = None
+    deviations: np.ndarray | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -143,6 +146,13 @@ class Calibration:
             raise InputError("The sensitivity holds NaN or infinite values; repair the table.")
         if not (np.all(np.diff(self.wavelength) > 0) and np.all(np.diff(self.angle) > 0)):
             raise InputError("The wavelengths and the angles of a calibration must increase.")
+        if self.deviations is not None and (
+            self.deviations.shape[1:] != expected or not np.all(np.isfinite(self.deviations))
+        ):
+            raise InputError(
+                f"The deviations have the shape {self.deviations.shape}; finite ones of the shape "
+                f"(draws, {', '.join(map(str, expected))}) were expected."
+            )
         if self.lattice is not None and len(self.lattice.centre) != self.filters:
             raise InputError(
                 f"The lattice has {len(self.lattice.centre)} units, the sensitivity {self.filters}."
@@ -176,6 +186,13 @@ class Calibration:
     def filters(self) -> int:
         """Number of filters, M."""
         return self.sensitivity.shape[-2]
+
+    @property
+    def uncertainty(self) -> np.ndarray | None:
+        """Standard deviation of the sensitivity's error, (A, M, K), in its unit; None: unknown."""
+        if self.deviations is None:
+            return None
+        return np.sqrt(np.mean(np.square(self.deviations, dtype=float), axis=0))
 
     @cached_property
     def mean_sensitivity(self) -> Tensor:
@@ -232,6 +249,74 @@ class Calibration:
             total += weights[..., node, None] * (cube @ sensitivity.T)
         return total
 
+    def tilted(
+        self,
+        effective_index: float,
+        *,
+        f_number: float,
+        corner: float | None = None,
+        measured_in_cone: bool = False,
+        vignetting: bool = True,
+        nodes: int = 5,
+    ) -> "Calibration":
+        """Return the calibration with the sensitivity at all field angles, from that on the axis.
+
+        Each pixel sees its filter in the cone of its lens, shifted to the blue; see
+        `squilla.optics.angle.blue_shift`.
+
+        Parameters
+        ----------
+        effective_index : float
+            Of the filters' thin films; 1.7 to 1.8 for TiO2 and SiO2.
+        f_number : float
+            Of each lens.
+        corner : float, optional
+            Largest field angle, rad; default: that of the lattice.
+        measured_in_cone : bool
+            Whether the camera itself measured the sensitivity through its lens (True), or a
+            spectrophotometer did in a parallel beam (False).
+        vignetting : bool
+            Whether measurements still have the natural vignetting, cos^4 of the angle.
+        nodes : int
+            Number of angles from the axis to the corner, even in their square; reconstructors
+            interpolate between them.
+
+        Raises
+        ------
+        InputError
+            If the sensitivity is known at several angles already, or a figure is out of range.
+        """
+        from squilla.optics.angle import COLLIMATED, blue_shift, pupil_cone
+
+        if len(self.angle) > 1:
+            raise InputError("The sensitivity is known at several field angles already.")
+        if corner is None:
+            if self.lattice is None:
+                raise InputError("Give the field angle of the corner, rad: no lattice is known.")
+            corner = float(self.lattice.field_angle().max())
+        if not 0 < corner < np.pi / 2:
+            raise InputError(f"The corner's field angle is {corner:g} rad; give one above 0.")
+        angle = np.sqrt(np.linspace(0, corner**2, nodes))
+        axis = pupil_cone(0.0, f_number) if measured_in_cone else COLLIMATED
+        shifts = np.stack(
+            [
+                (np.cos(one) ** 4 if vignetting else 1.0)
+                * blue_shift(
+                    self.wavelength, pupil_cone(one, f_number), effective_index, measured_in=axis
+                )
+                for one in angle
+            ]
+        )
+        return replace(
+            self,
+            sensitivity=self.sensitivity @ shifts.swapaxes(-1, -2),
+            deviations=None
+            if self.deviations is None
+            else self.deviations @ shifts.swapaxes(-1, -2),
+            angle=angle,
+            provenance=self.provenance | {"effective_index": effective_index, "f_number": f_number},
+        )
+
     def save(self, path: str | Path) -> None:
         """Write the calibration as one NetCDF file; see `squilla.calibration.store`."""
         from squilla.calibration.store import save_calibration
@@ -243,4 +328,8 @@ class Calibration:
         from squilla.spectra import resample
 
         values = resample(self.sensitivity, self.wavelength, wavelength)
-        return replace(self, wavelength=np.asarray(wavelength, float), sensitivity=values)
+        errors = self.deviations
+        if errors is not None:
+            errors = resample(errors, self.wavelength, wavelength)
+        wavelength = np.asarray(wavelength, float)
+        return replace(self, wavelength=wavelength, sensitivity=values, deviations=errors)

@@ -1,6 +1,7 @@
 """The calibration rehearsed with the twin: the frames that a lab would take of its own camera."""
 
 from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -9,9 +10,16 @@ from torch import Generator
 from xarray import DataArray
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.known import KnownScene
 from squilla.calibration.sensitivity import SweepStep
+from squilla.camera.scenes import chart_layout
 from squilla.camera.twin import Camera
+from squilla.files.cube import labelled
 from squilla.files.raw import Raw
+from squilla.spectra import lights, reflectances
+
+LAMPS = ("A", "FL11", "LED-B1", "LED-B5", "D65")
+"""White lamps of `squilla.spectra.lights` under which the chart of `Rehearsal.known` is shown."""
 
 
 class Rehearsal:
@@ -27,7 +35,12 @@ class Rehearsal:
     step, bandwidth : float
         Of the sweep, nm; bandwidth is the full width at half maximum.
     power_error : float
-        Relative error with which the reference detector knows the power of each step.
+        Relative error with which the reference detector knows the power of each step, and the lab
+        the brightness of each lamp.
+    power_drift : float
+        Relative change of the light over the whole sweep that the reference detector does not see.
+    stray_light : float
+        Share of the light of each step that is spread evenly over the band.
     distance : float
         Of the poster, mm.
 
@@ -43,6 +56,8 @@ class Rehearsal:
         step: float = 4.0,
         bandwidth: float = 4.0,
         power_error: float = 0.0,
+        power_drift: float = 0.0,
+        stray_light: float = 0.0,
         distance: float = 300.0,
     ):
         self.camera = camera
@@ -50,6 +65,8 @@ class Rehearsal:
         self.frames = frames
         self.bandwidth = bandwidth
         self.power_error = power_error
+        self.power_drift = power_drift
+        self.stray_light = stray_light
         self.distance = distance
         band = camera.design.band
         count = int(np.ceil((band.stop - band.start) / step)) + 1
@@ -59,13 +76,10 @@ class Rehearsal:
     def dark(self) -> Iterator[Raw]:
         """Yield frames with the lens covered, as long as the flats and as the steps at the ends.
 
-        Those need the longest exposures: half of their light is blocked.
+        Those need the longest exposures.
         """
         flat = self._exposure(self.camera.flat_rate(self._light))
-        longest = max(
-            self._exposure(self.camera.flat_rate(self._band(w))) for w in self.wavelengths[[0, -1]]
-        )
-        for kind, exposure in enumerate((flat, longest)):
+        for kind, exposure in enumerate((flat, self._longest)):
             for number in range(self.frames):
                 generator = self._generator(5 + kind, number)
                 yield self.camera.capture_dark(exposure, generator=generator)
@@ -77,13 +91,46 @@ class Rehearsal:
             yield self.camera.expose(rate, self._exposure(rate), self._generator(2, number))
 
     def sweep(self) -> Iterator[SweepStep]:
-        """Yield flat frames in narrow-band light, each exposed to the same level."""
+        """Yield flat frames in narrow-band light, each exposed to the same level.
+
+        The wavelengths are those of `wavelengths`, in their order; they may repeat, and lie outside
+        the camera's band.
+        """
+        last = max(len(self.wavelengths) - 1, 1)
         for number, wavelength in enumerate(self.wavelengths):
             generator = self._generator(3, number)
-            rate = self.camera.flat_rate(self._band(wavelength))
-            raw = self.camera.expose(rate, self._exposure(rate), generator)
+            drift = 1 + self.power_drift * (number / last - 0.5)
+            rate = drift * self.camera.flat_rate(self._band(wavelength))
+            exposure = min(self._exposure(rate), self._longest)
+            raw = self.camera.expose(rate, exposure, generator)
             error = self.power_error * float(torch.randn(1, generator=generator))
             yield SweepStep(raw, float(wavelength), 1.0 + error, self.bandwidth)
+
+    def known(self, lamps: np.ndarray | None = None) -> Iterator[KnownScene]:
+        """Yield frames of a chart of 24 matte surfaces under each of some lamps.
+
+        The surfaces are from the Esser chart in `squilla.spectra.reflectances`.
+
+        Parameters
+        ----------
+        lamps : array, (lamps, K), optional
+            Photon radiance of white in their light; default: `LAMPS`.
+        """
+        size, wavelength = self.camera.design.field.size, self.camera.design.wavelength
+        table, labels = reflectances(), chart_layout(size, size)
+        chart = [number for number, name in enumerate(table.name) if name.startswith("esser")]
+        chart = np.array(chart)[np.linspace(0, len(chart) - 1, 24).astype(int)]
+        surface = np.vstack([table.on(wavelength)[chart], np.full(len(wavelength), 0.03)])
+        if lamps is None:
+            names = [lights().name.index(name) for name in LAMPS]
+            lamps = lights().on(wavelength)[names]
+        for number, lamp in enumerate(lamps):
+            generator = self._generator(7, number)
+            scene = labelled((surface * lamp).astype(np.float32)[labels], wavelength)
+            rate = self.camera.rate(scene, distance=self.distance)
+            raw = self.camera.expose(rate, self._exposure(rate), generator)
+            error = self.power_error * float(torch.randn(1, generator=generator))
+            yield KnownScene(raw, (1 + error) * surface[:-1] * lamp, labels, self.distance)
 
     def target(self) -> Raw:
         """Return a frame of a textured poster at `distance`, facing the camera."""
@@ -96,7 +143,15 @@ class Rehearsal:
         design = self.camera.design
         sigma = self.bandwidth / np.sqrt(8 * np.log(2))
         band = np.exp(-((design.wavelength - wavelength) ** 2) / (2 * sigma**2))
-        return band * design.band.step / (sigma * np.sqrt(2 * np.pi))
+        band = band * design.band.step / (sigma * np.sqrt(2 * np.pi))
+        return (1 - self.stray_light) * band + self.stray_light / len(band)
+
+    @cached_property
+    def _longest(self) -> float:
+        """The exposure of the steps at the ends of the band, ms: half of their light is blocked."""
+        band = self.camera.design.band
+        ends = (self._band(wavelength) for wavelength in (band.start, band.stop))
+        return max(self._exposure(self.camera.flat_rate(light)) for light in ends)
 
     def _exposure(self, rate: np.ndarray) -> float:
         """Return the exposure at which the brightest sub-image fills 70 % of the scale, ms."""

@@ -2,15 +2,20 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from squilla.calibration.calibration import Lattice
+from squilla.calibration.inference import Inferred, infer_sensitivity
 from squilla.calibration.pixels import Darks
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 
 Window = tuple[slice, slice]
+
+_OUTSIDE = 1e-3
+"""Share of its light within the band below which a step lies outside."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +24,8 @@ class SweepStep:
 
     raw : the frame.
     wavelength : middle of the band, nm.
-    power : photon radiance of the light, summed over the band, in the unit that cubes shall have.
+    power : photon radiance of the light by the reference detector, summed over the band, in the
+        unit that cubes shall have.
     bandwidth : full width at half maximum of the light, nm.
     """
 
@@ -109,9 +115,24 @@ class Zones:
         return image
 
 
+@dataclass(frozen=True)
+class Responses:
+    """What the steps of a sweep say, in the order in which they were taken.
+
+    wavelength, bandwidth : (S,) middle and full width at half maximum of the light, nm.
+    response : (S, A, M) DN per ms and unit of power.
+    saturated : wavelengths of the steps that were left out, nm.
+    """
+
+    wavelength: np.ndarray
+    bandwidth: np.ndarray
+    response: np.ndarray
+    saturated: tuple[float, ...] = ()
+
+
 def sweep_responses(
     steps: Iterable[SweepStep], darks: Darks, flat: np.ndarray, saturation: float, zones: Zones
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> Responses:
     """Reduce the frames of a sweep, one by one, to responses per unit of light.
 
     Parameters
@@ -120,17 +141,20 @@ def sweep_responses(
     darks : Darks
     flat : array, (rows, columns)
     saturation : float
-        DN; steps with more than 0.1 % saturated pixels in the sub-images are refused.
+        DN; a step with more than 0.1 % saturated pixels is left out.
     zones : Zones
 
     Returns
     -------
-    wavelength, bandwidth : array, (S,)
-        nm, sorted.
-    response : array, (S, A, M)
-        DN per ms and unit of power.
+    Responses
+
+    Raises
+    ------
+    InputError
+        If a frame or its figures cannot be used, or more than a tenth of the steps, and more than
+        two, are saturated.
     """
-    rows = []
+    rows, saturated = [], []
     for step in steps:
         figures = (step.wavelength, step.power, step.bandwidth, step.raw.exposure or 0.0)
         if not (np.isfinite(figures).all() and min(figures) > 0):
@@ -144,9 +168,8 @@ def sweep_responses(
                 f"flats {flat.shape}; take all with one camera."
             )
         if np.mean(step.raw.frame >= saturation) > 1e-3:
-            raise InputError(
-                f"The sweep frame at {step.wavelength:g} nm is saturated; shorten its exposure."
-            )
+            saturated.append(float(step.wavelength))
+            continue
         frame, exposure = step.raw.frame, np.float32(step.raw.exposure)
         response = zones(
             lambda at, frame=frame, exposure=exposure: (
@@ -154,59 +177,130 @@ def sweep_responses(
             )
         )
         rows.append((step.wavelength, step.bandwidth, response / (step.power * exposure)))
-    if len(rows) < 2:
-        raise InputError("A sweep needs at least two wavelengths.")
-    rows.sort(key=lambda row: row[0])
+    if len(saturated) > max(2, 0.1 * len(rows)):
+        raise InputError(
+            f"{len(saturated)} frames of the sweep are saturated, that at {saturated[0]:g} nm for "
+            "one; shorten their exposure."
+        )
+    if len(rows) < 3:
+        raise InputError(f"A sweep needs at least three wavelengths; there are {len(rows)}.")
     wavelength, bandwidth, response = map(np.array, zip(*rows, strict=True))
-    if np.any(np.diff(wavelength) <= 0):
-        raise InputError("The sweep holds a wavelength twice; average those frames first.")
-    return wavelength, bandwidth, response
+    return Responses(wavelength, bandwidth, response, tuple(saturated))
 
 
-def unfold(
-    wavelength: np.ndarray, bandwidth: np.ndarray, response: np.ndarray, grid: np.ndarray
-) -> np.ndarray:
-    """Estimate the sensitivity on a fine grid from responses to light of finite bandwidth.
+def sweep_sensitivity(sweep: Responses, grid: np.ndarray) -> tuple[Inferred, dict[str, Any]]:
+    """Infer the sensitivity from the responses of a sweep, and say what was wrong with it.
 
-    Minimises ||G R - response||^2 + mu ||R''||^2, where a row of G is the Gaussian band of one step
-    and mu is chosen by generalised cross-validation over all filters and angles at once. Light
-    outside the grid is taken to be blocked by the camera's band filter.
+    The finite bandwidth is undone; steps may be missing and unevenly spaced. A wavelength that
+    comes back shows how the light drifts beside the reference detector, steps outside the camera's
+    band show the stray light of the monochromator; both are then taken out. A step that disagrees
+    with its neighbours in all filters at once, by far more than the others do, is left out.
 
     Parameters
     ----------
-    wavelength, bandwidth : array, (S,)
-        Middle and full width at half maximum of each step, nm.
-    response : array, (S, ...)
+    sweep : Responses
     grid : array, (K,)
-        Even wavelength grid within the sweep, nm.
+        Even wavelength grid, nm, which the sweep must cover.
 
     Returns
     -------
-    array, (..., K)
+    Inferred
+    dict
+        saturated_steps, doubted_steps : wavelengths left out, as text.
+        power_noise : relative standard deviation of the power from step to step.
+        power_drift : relative change over the whole sweep; None where no wavelength comes back.
+        stray_light : share of each step's light that is spread over the band; None where no step
+            lies outside.
 
-    Source: Golub, Heath, Wahba, Technometrics 21 (1979), for the cross-validation.
+    Raises
+    ------
+    InputError
+        If the sweep does not cover the grid, or the camera sees light outside it.
+    """
+    light = gaussian_bands(sweep.wavelength, sweep.bandwidth, grid)
+    response, drift = _without_drift(sweep)
+    outside = light.sum(-1) < _OUTSIDE
+    stray = None
+    if outside.any() and not outside.all():
+        response, stray = _without_stray_light(sweep.wavelength, response, light.sum(-1))
+    middle, light, response = sweep.wavelength[~outside], light[~outside], response[~outside]
+    _check_cover(middle, grid)
+    found = infer_sensitivity(light, response, grid)
+    size = np.abs(found.power_error)
+    doubted = size > max(0.05, 10 * float(np.median(size)))
+    if doubted.sum() > max(2, 0.1 * len(doubted)):
+        raise InputError(
+            f"{doubted.sum()} steps of the sweep contradict the others, that at "
+            f"{middle[doubted][0]:g} nm for one, in all filters at once; check their powers."
+        )
+    if doubted.any():
+        _check_cover(middle[~doubted], grid)
+        found = infer_sensitivity(light[~doubted], response[~doubted], grid)
+    return found, {
+        "saturated_steps": _listed(sweep.saturated),
+        "doubted_steps": _listed(middle[doubted]),
+        "power_noise": found.power_noise,
+        "power_drift": drift,
+        "stray_light": stray,
+    }
+
+
+def gaussian_bands(wavelength: np.ndarray, bandwidth: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return the spectra of narrow-band lights on an even grid, (S, K), each with a sum of 1.
+
+    Of a light that reaches beyond the grid only the part within is there.
     """
     step = grid[1] - grid[0]
-    reach = max(np.diff(wavelength).max(), step)
-    if wavelength[0] > grid[0] + reach or wavelength[-1] < grid[-1] - reach:
-        raise InputError(
-            f"The sweep covers {wavelength[0]:g}-{wavelength[-1]:g} nm, the camera's band is "
-            f"{grid[0]:g}-{grid[-1]:g} nm; sweep the whole band."
-        )
     sigma = np.maximum(bandwidth, 0.5 * step)[:, None] / np.sqrt(8 * np.log(2))
     band = np.exp(-((grid - wavelength[:, None]) ** 2) / (2 * sigma**2))
-    band *= step / (sigma * np.sqrt(2 * np.pi))  # each holds all the light of its step
-    bend = np.diff(np.eye(len(grid)), 2, axis=0)
-    flat = response.reshape(len(wavelength), -1)
-    best = None
-    normal, rough = band.T @ band, bend.T @ bend
-    scale = np.trace(normal) / np.trace(rough)
-    for mu in scale * 10.0 ** np.arange(-6, 6.5, 0.5):
-        solve = np.linalg.solve(normal + mu * rough + 1e-12 * np.eye(len(grid)), band.T)
-        left = flat - band @ (solve @ flat)
-        freedom = len(wavelength) - np.trace(band @ solve)
-        score = float((left**2).sum()) / max(freedom, 1e-6) ** 2
-        if best is None or score < best[0]:
-            best = (score, solve @ flat)
-    assert best is not None
-    return np.moveaxis(best[1].reshape(len(grid), *response.shape[1:]), 0, -1)
+    return band * step / (sigma * np.sqrt(2 * np.pi))
+
+
+def _without_drift(sweep: Responses) -> tuple[np.ndarray, float | None]:
+    """Return responses without the drift that wavelengths measured again show, and its size."""
+    near = np.abs(sweep.wavelength[:, None] - sweep.wavelength) < 0.01
+    again = near.sum(-1) > 1
+    if again.sum() - len(np.unique(near[again], axis=0)) < 2:
+        return sweep.response, None
+    when = np.arange(len(near)) / (len(near) - 1)
+    level = np.log(np.maximum(sweep.response.mean((1, 2)), 1e-300))
+    mean = near / near.sum(-1, keepdims=True)
+    later, higher = ((each - mean @ each)[again] for each in (when, level))
+    rate = float(later @ higher / (later @ later))
+    return sweep.response * np.exp(-rate * (when - 0.5))[:, None, None], float(np.expm1(rate))
+
+
+def _without_stray_light(
+    wavelength: np.ndarray, response: np.ndarray, within: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return responses without the part that steps outside the band show, and its share.
+
+    Stray light is taken to be even over the band; `within` is the share, (S,), of each step's light
+    that lies in the band.
+    """
+    outside, inside = within < _OUTSIDE, np.flatnonzero(within > 0.3)
+    inside = inside[np.argsort(wavelength[inside], kind="stable")]
+    width = np.gradient(wavelength[inside])
+    white = np.average(response[inside] / within[inside, None, None], axis=0, weights=width)
+    share = float((response[outside] * white).sum() / (outside.sum() * (white**2).sum()))
+    if share > 0.05:
+        raise InputError(
+            f"At {wavelength[outside][0]:g} nm, outside its band, the camera still sees "
+            f"{100 * share:.0f} % of the light; widen the design's band to all that it sees."
+        )
+    share = max(share, 0.0)
+    return (response - share * white) / (1 - share), share
+
+
+def _check_cover(wavelength: np.ndarray, grid: np.ndarray) -> None:
+    low, high = (wavelength.min(), wavelength.max()) if len(wavelength) else (np.inf, -np.inf)
+    reach = max(float(np.diff(np.sort(wavelength)).max(initial=0)), grid[1] - grid[0])
+    if low > grid[0] + reach or high < grid[-1] - reach:
+        raise InputError(
+            f"The sweep covers {low:g}-{high:g} nm, the camera's band is "
+            f"{grid[0]:g}-{grid[-1]:g} nm; sweep the whole band."
+        )
+
+
+def _listed(wavelengths: Iterable[float]) -> str:
+    return ", ".join(f"{each:g} nm" for each in wavelengths) or "none"

@@ -39,6 +39,9 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
         "wavelength": ("wavelength", calibration.wavelength, nm),
         "angle": ("angle", calibration.angle, {"units": "rad", "long_name": "field angle"}),
     }
+    if calibration.deviations is not None:
+        errors = calibration.deviations.astype(np.float32)
+        variables["deviations"] = (("draw", "angle", "unit", "wavelength"), errors)
     attributes: dict = {
         "Conventions": "CF-1.11",
         "kind": _KIND,
@@ -113,6 +116,7 @@ def load_calibration(path: str | Path) -> Calibration:
             dataset["angle"].values.astype(float),
             lattice,
             pixels,
+            dataset["deviations"].values if "deviations" in dataset else None,
             json.loads(facts["provenance"]),
         )
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from squilla.camera.design import CameraDesign
+from squilla.optics.angle import pupil_cone, pupil_points
 from squilla.optics.materials import refractive_index
 
 
@@ -136,20 +137,14 @@ def cone(design: CameraDesign, angle: float, rings: int = 4) -> tuple[np.ndarray
         rad; weights are cos^4 and sum to 1, without the light that misses the filter. Without the
         cone only the chief ray; without the field angle the pixel is taken to be on the axis.
     """
-    chief = np.tan(angle) if design.effects.field_angle else 0.0
+    chief = float(angle) if design.effects.field_angle else 0.0
     if not design.effects.cone:
-        return np.array([np.arctan(chief)]), np.ones(1)
-    slope = design.lens.diameter / (2 * design.lens.focal_length)
-    x, y = [np.zeros(1)], [np.zeros(1)]
-    for ring in range(1, rings + 1):  # equal area for each point
-        turn = 2 * np.pi * np.arange(6 * ring) / (6 * ring)
-        radius = slope * np.sqrt(3 * ring**2 / (3 * rings * (rings + 1) + 1))
-        x.append(radius * np.cos(turn))
-        y.append(radius * np.sin(turn))
-    x, y = np.concatenate(x), np.concatenate(y)
-    angles = np.arctan(np.hypot(chief - x, y))
+        return pupil_cone(chief, np.inf)
     focal = design.lens.focal_length
-    weights = np.cos(angles) ** 4 * _passing(design, float(angle), focal * x, focal * y)
+    f_number = focal / design.lens.diameter
+    angles, weights = pupil_cone(chief, f_number, rings)
+    x, y = pupil_points(f_number, rings)
+    weights = weights * _passing(design, float(angle), focal * x, focal * y)
     return angles, weights / weights.sum()
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from squilla.calibration.rehearsal import Rehearsal
     from squilla.camera.design import CameraDesign
 
 
@@ -77,6 +78,9 @@ def rehearse(
     frames: Annotated[int, typer.Option(help="Darks and flats of each exposure.")] = 8,
     distance: Annotated[float, typer.Option(help="Of the poster, mm.")] = 300.0,
     power_error: Annotated[float, typer.Option(help="Of the reference detector, relative.")] = 0.0,
+    known: Annotated[
+        bool, typer.Option("--known", help="Also a chart of known spectra under five lamps.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of all noise.")] = 0,
 ) -> None:
     """Let the twin take all calibration frames that `squilla calibrate` wants.
@@ -119,11 +123,33 @@ def rehearse(
     ):
         csv.writer(stream).writerows(table)
     write_raw(output / "target.tiff", rehearsal.target())
+    if known:
+        _write_known(rehearsal, output / "known")
     typer.echo(
         f"{output}: now run\n  squilla calibrate --camera {camera} --dark {output}/dark "
         f"--flat {output}/flat --sweep {output}/sweep --target {output}/target.tiff "
         f"--target-distance {distance:g} -o camera.nc"
     )
+
+
+def _write_known(rehearsal: "Rehearsal", folder: Path) -> None:
+    """Write frames of known surfaces as `squilla calibrate --known` reads them."""
+    import numpy as np
+    from PIL import Image
+
+    from squilla.files.raw import write_raw
+
+    folder.mkdir(exist_ok=True)
+    wavelength = rehearsal.camera.design.wavelength
+    table = [("file", "spectra", "labels", "distance")]
+    for number, scene in enumerate(rehearsal.known()):
+        row = (f"{number:03d}.tiff", f"{number:03d}.txt", "labels.png", f"{scene.distance:g}")
+        write_raw(folder / row[0], scene.raw)
+        np.savetxt(folder / row[1], np.vstack([wavelength, scene.spectra]).T, fmt="%.7g")
+        Image.fromarray((scene.labels + 1).astype(np.uint8)).save(folder / row[2])
+        table.append(row)
+    with (folder / "known.csv").open("w", newline="", encoding="utf-8") as stream:
+        csv.writer(stream).writerows(table)
 
 
 def models(

@@ -11,7 +11,10 @@ import typer
 from squilla.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from squilla.batch import Recipe
+    from squilla.calibration.known import KnownScene
     from squilla.calibration.sensitivity import SweepStep
     from squilla.files.raw import Frame
 
@@ -106,7 +109,12 @@ def calibrate(
     output: Annotated[Path, typer.Option("-o", "--output", help="Calibration to write, .nc.")],
     dark: Annotated[Path, typer.Option(help="Frames without light: a file or folder.")],
     flat: Annotated[Path, typer.Option(help="Frames of an even white: a file or folder.")],
-    sweep: Annotated[Path, typer.Option(help="Folder with narrow-band flats and sweep.csv.")],
+    sweep: Annotated[
+        Path | None, typer.Option(help="Folder with narrow-band flats and sweep.csv.")
+    ] = None,
+    known: Annotated[
+        Path | None, typer.Option(help="Instead: folder with known surfaces and known.csv.")
+    ] = None,
     target: Annotated[Path | None, typer.Option(help="Frame of a textured plane.")] = None,
     target_distance: Annotated[float | None, typer.Option(help="Its distance, mm.")] = None,
     camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
@@ -117,6 +125,10 @@ def calibrate(
     sweep.csv has the columns file, wavelength (nm), power (photon radiance of the light) and
     bandwidth (nm, full width at half maximum).
 
+    Without a monochromator: known.csv has the columns file (a frame), spectra (a text file: a
+    column of wavelengths in nm, then the photon radiance of each surface), labels (a picture of
+    the reference view: 1 where it shows the first surface, 0 where none) and distance (mm).
+
     Example: squilla calibrate --dark dark --flat flat --sweep sweep --target target.tiff
     --target-distance 300 -o camera.nc
     """
@@ -126,12 +138,15 @@ def calibrate(
     from squilla.camera.design import CameraDesign
     from squilla.files.raw import read_raw, read_raws
 
-    steps = read_sweep(sweep)
+    design = CameraDesign.load(camera)
+    steps = None if sweep is None else read_sweep(sweep)
+    scenes = None if known is None else read_known(known, design.wavelength)
     calibration = calibrate(
-        CameraDesign.load(camera),
+        design,
         dark=track(read_raws(dark), "darks", disable=as_json),
         flat=track(read_raws(flat), "flats", disable=as_json),
-        sweep=track(steps, "sweep", disable=as_json),
+        sweep=None if steps is None else track(steps, "sweep", disable=as_json),
+        known=None if scenes is None else track(scenes, "known scenes", disable=as_json),
         target=None if target is None else read_raw(target),
         target_distance=target_distance,
     )
@@ -146,6 +161,10 @@ def calibrate(
         f"{len(calibration.angle)} field angles; {pixels.gain:.2f} e-/DN, read noise "
         f"{pixels.read_noise:.1f} e-, {calibration.provenance['bad_pixels']} bad pixels"
     )
+    for name in ("saturated_steps", "doubted_steps"):
+        left_out = calibration.provenance.get(name, "none")
+        if left_out != "none":
+            typer.echo(f"  left out, {name.removesuffix('_steps')}: {left_out}")
 
 
 def reconstruct(
@@ -280,29 +299,62 @@ def evaluate(
 def read_sweep(folder: Path) -> "Iterator[SweepStep]":
     """Read ``sweep.csv`` in a folder at once, and return an iterator over the frames it lists."""
     from squilla.calibration.sensitivity import SweepStep
-    from squilla.files.disk import existing
     from squilla.files.raw import read_raw
 
-    table = folder / "sweep.csv"
+    listed = _listed(folder / "sweep.csv", ("file",), ("wavelength", "power", "bandwidth"))
+    return (SweepStep(read_raw(path), *values) for (path,), values in listed)
+
+
+def read_known(folder: Path, wavelength: "np.ndarray") -> "Iterator[KnownScene]":
+    """Read ``known.csv`` in a folder at once, and return an iterator over the scenes it lists."""
+    import numpy as np
+    from PIL import Image, UnidentifiedImageError
+
+    from squilla.calibration.known import KnownScene
+    from squilla.files.raw import read_raw
+    from squilla.optics.materials import read_columns
+    from squilla.spectra import resample
+
+    listed = _listed(folder / "known.csv", ("file", "spectra", "labels"), ("distance",))
+
+    def scene(paths: list[Path], distance: float) -> KnownScene:
+        frame, spectra, labels = paths
+        columns = read_columns(spectra).T
+        try:
+            with Image.open(labels) as picture:
+                numbers = np.asarray(picture).astype(int) - 1
+        except (OSError, UnidentifiedImageError) as error:
+            raise InputError(f"The labels {labels} cannot be read as a picture: {error}.") from None
+        values = resample(columns[1:], columns[0], wavelength)
+        return KnownScene(read_raw(frame), values, numbers, distance)
+
+    return (scene(paths, distance) for paths, (distance,) in listed)
+
+
+def _listed(
+    table: Path, files: tuple[str, ...], numbers: tuple[str, ...]
+) -> list[tuple[list[Path], list[float]]]:
+    """Read a table of files beside it and numbers; every file must be there."""
+    from squilla.files.disk import existing
+
+    wanted = ", ".join((*files, *numbers))
     try:
         with table.open(newline="", encoding="utf-8") as stream:
             rows = list(csv.DictReader(stream))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(
-            f"{table} cannot be read ({error}); a sweep is a folder of frames with a table "
-            "sweep.csv of file, wavelength, power, bandwidth."
+            f"{table} cannot be read ({error}); wanted is a folder of frames with a table "
+            f"{table.name} of {wanted}."
         ) from error
     listed = []
-    for number, row in enumerate(rows, 2):
+    for line, row in enumerate(rows, 2):
         try:
-            path = folder / row["file"]
-            values = [float(row[key]) for key in ("wavelength", "power", "bandwidth")]
+            paths = [table.parent / row[name] for name in files]
+            values = [float(row[name]) for name in numbers]
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{table}, line {number}: wanted are file, wavelength, power and bandwidth (nm)."
-            ) from error
-        listed.append((existing(path), values))
-    return (SweepStep(read_raw(path), *values) for path, values in listed)
+            raise InputError(f"{table}, line {line}: wanted are {wanted}.") from error
+        listed.append(([existing(path) for path in paths], values))
+    return listed
 
 
 def read_depth(path: Path, shape: tuple[int, ...]):

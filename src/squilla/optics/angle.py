@@ -22,9 +22,50 @@ from squilla.spectra import resample
 
 Cone = tuple[ArrayLike, ArrayLike]
 """Angles of incidence, (P,) rad, and their weights, (P,), which sum to 1; one for each point of the
-pupil, as `squilla.camera.lens.cone` gives them. A collimated beam is ([angle], [1])."""
+pupil, as `pupil_cone` gives them. A collimated beam is ([angle], [1])."""
 
 COLLIMATED: Cone = (np.zeros(1), np.ones(1))
+
+
+def pupil_cone(angle: float, f_number: float, rings: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cone of light in which a pixel behind a round lens sees its filter.
+
+    Parameters
+    ----------
+    angle : float
+        Field angle of the pixel (chief ray), rad.
+    f_number : float
+        Focal length over diameter of the lens; infinite for a collimated beam.
+    rings : int
+        Rings of points over the pupil, each of six times its number and all of equal area.
+
+    Returns
+    -------
+    angles, weights : array, (P,)
+        rad; weights are cos^4 and sum to 1.
+    """
+    if not f_number > 0:
+        raise InputError(f"The F-number is {f_number}; it must be above 0, as 4 for an F/4 lens.")
+    if np.isinf(f_number):
+        return np.array([float(angle)]), np.ones(1)
+    x, y = pupil_points(f_number, rings)
+    angles = np.arctan(np.hypot(np.tan(angle) - x, y))
+    weights = np.cos(angles) ** 4
+    return angles, weights / weights.sum()
+
+
+def pupil_points(f_number: float, rings: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of equal area over a round pupil, x and y, (P,) focal lengths.
+
+    The first in the middle, then rings of six times their number.
+    """
+    x, y = [np.zeros(1)], [np.zeros(1)]
+    for ring in range(1, rings + 1):
+        turn = 2 * np.pi * np.arange(6 * ring) / (6 * ring)
+        radius = np.sqrt(3 * ring**2 / (3 * rings * (rings + 1) + 1)) / (2 * f_number)
+        x.append(radius * np.cos(turn))
+        y.append(radius * np.sin(turn))
+    return np.concatenate(x), np.concatenate(y)
 
 
 def blue_shift(

@@ -16,10 +16,11 @@ SNR = 20.0
 
 
 class Ridge(Reconstructor):
-    """The best linear estimator for the broad prior: x = S R' (R S R' + sigma^2 I)^-1 y.
+    """The best linear estimator for the broad prior: x = S R' (R S R' + E + sigma^2 I)^-1 y.
 
     S is the second moment of the spectra (their mean is not taken off, so that twice the light
-    gives twice the spectrum). In the eigenvectors of R S R' = U L U' the noise of each pixel,
+    gives twice the spectrum), E that of what an uncertain R measures wrong of them (`model_error`).
+    In the eigenvectors of R S R' + E = U L U' the noise of each pixel,
     sigma^2, only divides by another L + sigma^2, so every pixel is treated by its own. Negative
     values of the estimate are clipped to zero, which moves every spectrum nearer to the truth or
     leaves it.
@@ -46,7 +47,8 @@ class Ridge(Reconstructor):
         moment = second_moment(calibration) if moment is None else moment
         response = calibration.sensitivities.double()
         response = torch.cat([response, calibration.mean_sensitivity.double()[None]])
-        power, basis = torch.linalg.eigh(response @ moment @ response.mT)  # (A + 1, M), (.., M, M)
+        signal = response @ moment @ response.mT + model_error(calibration, moment)
+        power, basis = torch.linalg.eigh(signal)  # (A + 1, M), (A + 1, M, M)
         self.register_buffer("basis", basis.float(), persistent=False)
         self.register_buffer("power", power.clamp_min(0).float(), persistent=False)
         self.register_buffer("gain", (basis.mT @ response @ moment).float(), persistent=False)
@@ -63,6 +65,50 @@ class Ridge(Reconstructor):
             for weight, basis, power in zip(weights.T, self.basis, self.power, strict=False)
         ]
         return torch.cat(parts, -1) @ self.gain[:-1].flatten(0, 1)
+
+
+def levelling(calibration: Calibration) -> Tensor:
+    """Return what turns measurements at a field angle into those that the mean sensitivity gives.
+
+    A network learns one sensitivity. The difference of the others to it is small, so that the
+    linear estimate of the spectrum is good enough to take it off: y - (R_a - R) W_a y.
+
+    Returns
+    -------
+    Tensor, (A, M, M), float32; for noise of 30 dB, which serves 20 to 40
+    """
+    moment = second_moment(calibration)
+    response, mean = calibration.sensitivities.double(), calibration.mean_sensitivity.double()
+    signal = response @ moment @ response.mT
+    one = torch.eye(calibration.filters, dtype=torch.float64)
+    noise = 1e-3 * signal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] * one
+    estimator = torch.linalg.solve(signal + noise, response @ moment).mT
+    return (one - (response - mean) @ estimator).float()
+
+
+def model_error(calibration: Calibration, moment: Tensor) -> Tensor:
+    """Return what the uncertainty of the sensitivity adds to measurements, as a second moment.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    moment : Tensor, (K, K), float64
+        Second moment of the spectra.
+
+    Returns
+    -------
+    Tensor, (A + 1, M, M), float64
+        The mean of (dR x)(dR x)' over the draws of the error dR, at each field angle and, last, for
+        the mean sensitivity; zero where the calibration does not know its errors.
+    """
+    filters = calibration.filters
+    total = torch.zeros(len(calibration.angle) + 1, filters, filters, dtype=torch.float64)
+    if calibration.deviations is None:
+        return total
+    for draw in torch.from_numpy(calibration.deviations).double():
+        error = torch.cat([draw, draw.mean(0, keepdim=True)])
+        total += error @ moment @ error.mT
+    return total / len(calibration.deviations)
 
 
 def _noise_to_signal(snr: Tensor | None, count: int, device: torch.device) -> Tensor:

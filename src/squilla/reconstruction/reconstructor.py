@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
+from functools import cached_property
 from importlib import import_module
 from importlib.resources import files as package_files
 from pathlib import Path
@@ -77,6 +78,8 @@ class Reconstructor(nn.Module):
     def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None) -> Tensor:
         """Map finite measurements with a maximum of 1, (N, M), to spectra, (N, K).
 
+        Networks get them `levelled`.
+
         angle : (N,) rad, or None for the mean sensitivity.
         snr : (N,) dB, or None where it is unknown; networks do without.
         """
@@ -136,11 +139,29 @@ class Reconstructor(nn.Module):
         peak = y.amax(-1, keepdim=True)
         lit = peak > 0
         y = y / torch.where(lit, peak, 1)
-        x = self.estimate(y, angle, snr).clamp_min(0)
+        x = self.estimate(self.levelled(y, angle), angle, snr).clamp_min(0)
         factor = torch.where(finite, torch.where(lit, peak, 0), torch.nan)
         if self.trained and scale == "consistent":
             factor = factor * consistent_scale(y, x, self.calibration, angle)
         return x * factor
+
+    def levelled(self, y: Tensor, angle: Tensor | None) -> Tensor:
+        """Return measurements as `estimate` wants them, (N, M).
+
+        What a network sees is brought to the mean sensitivity, the one that it learns; see
+        `linear.levelling`. Estimators that know the sensitivity at every angle take y as it is.
+        """
+        if not self.trained or angle is None or len(self.calibration.angle) == 1:
+            return y
+        weights = self.calibration.angle_weights(angle.cpu()).to(y)
+        seen = torch.einsum("nm,akm->ank", y, self._levelling.to(y))
+        return torch.einsum("na,ank->nk", weights, seen)
+
+    @cached_property
+    def _levelling(self) -> Tensor:
+        from squilla.reconstruction.linear import levelling
+
+        return levelling(self.calibration)
 
     def _accepted(
         self, y: Tensor, angle: Tensor | None, snr: Tensor | float | None

@@ -250,7 +250,7 @@ class _Run:
     def _estimate(self, y: Tensor, angle: Tensor) -> Tensor:
         half = self.settings["precision"] == "bfloat16"
         with torch.autocast(self.device.type, torch.bfloat16, enabled=half):
-            return self.model.estimate(y, angle).float()
+            return self.model.estimate(self.model.levelled(y, angle), angle).float()
 
     def _rate(self, share: float) -> float:
         """Return the learning rate after this share of the training."""
