@@ -202,7 +202,7 @@ def ideal_calibration(camera: Camera, angles: int = 5) -> Calibration:
     )
     provenance = {"design": design.name, "camera": camera.serial, "made": "from the twin's truth"}
     return Calibration(
-        design.wavelength, camera.sensitivity(angle), angle, lattice, pixels, provenance
+        design.wavelength, camera.sensitivity(angle), angle, lattice, pixels, provenance=provenance
     )
 
 
