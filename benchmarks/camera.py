@@ -28,7 +28,7 @@ from squilla.live.twin_camera import Simulation, TwinCamera, description
 from squilla.live.twin_frames import TwinFrames
 
 SHAPE = (3000, 4000)
-SECONDS = 8.0
+SECONDS = 6.0
 
 
 def milliseconds(call, repeats: int = 15) -> float:
