@@ -37,7 +37,6 @@ _CONTROL = 0x0A00  # GigE Vision bootstrap register: who controls the camera
 
 _PLAIN = {
     "arv_update_device_list": (None,),
-    "arv_enable_interface": (None, c_char_p),
     "arv_get_n_devices": (c_uint,),
     "arv_get_device_id": (c_char_p, c_uint),
     "arv_get_device_vendor": (c_char_p, c_uint),
@@ -220,9 +219,9 @@ class AravisConnection:
             ) from error
         self._stream = None
         try:
-            self._device = lib.arv_camera_get_device(self._camera)
+            self.device = lib.arv_camera_get_device(self._camera)
             self._network = bool(lib.arv_camera_is_gv_device(self._camera))
-            if self._network and not lib.arv_gv_device_is_controller(self._device):
+            if self._network and not lib.arv_gv_device_is_controller(self.device):
                 raise InputError(
                     f"The camera {name or 'found'} is controlled by another program; close that "
                     "one first. A program that was killed holds it for a few seconds more."
@@ -365,10 +364,10 @@ class AravisConnection:
                 self._lib.arv_camera_get_payload(self._camera)
                 return True
             value = c_uint32()
-            self._lib.arv_device_read_register(self._device, _CONTROL, byref(value))
+            self._lib.arv_device_read_register(self.device, _CONTROL, byref(value))
         except CameraLost:
             return False
-        return value.value != 0 and bool(self._lib.arv_gv_device_is_controller(self._device))
+        return value.value != 0 and bool(self._lib.arv_gv_device_is_controller(self.device))
 
     def close(self) -> None:
         self._drop_stream()
