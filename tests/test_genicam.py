@@ -18,11 +18,11 @@ from squilla.camera.twin import Camera
 from squilla.cli.app import app
 from squilla.errors import InputError
 from squilla.files.raw import read_raws
-from squilla.live import aravis, gentl, twin_camera
+from squilla.live import aravis, gentl
 from squilla.live.connection import CameraLost, Region
-from squilla.live.genicam import LiveCamera, open_camera
+from squilla.live.genicam import open_camera
 from squilla.live.pixel_format import FORMATS
-from squilla.live.twin_camera import Simulation, TwinCamera, description
+from squilla.live.twin_camera import TwinCamera, camera_within
 from squilla.live.twin_frames import TwinFrames
 
 try:
@@ -320,25 +320,12 @@ def test_a_machine_without_the_library(monkeypatch):
 @installed
 def test_twelve_megapixels_arrive_bit_exact():
     """Through the library's camera within the process, which sends nothing over a network."""
-    camera = Camera("thesis")
-    frames = TwinFrames(camera, [np.full((3000, 4000), 50, np.float32)])
-    lib = aravis.library()
-    lib.arv_enable_interface(b"Fake")
-    path = str(description()).encode()
-    bind = aravis.bind({
-        "arv_set_fake_camera_genicam_filename": (None, twin_camera.c_char_p),
-        "arv_fake_device_get_fake_camera": (twin_camera.pointer, twin_camera.pointer),
-    })  # fmt: skip
-    bind["arv_set_fake_camera_genicam_filename"](path)
-    connection = aravis.AravisConnection("Fake_1")
-    inner = bind["arv_fake_device_get_fake_camera"](connection._device)
-    simulation = Simulation(inner, frames, 10.0)
-    with LiveCamera(lambda: connection, None, 0.0, None) as live:
-        live.region = Region(3000, 4000)
+    frames = TwinFrames(Camera("thesis"), [np.full((3000, 4000), 50, np.float32)])
+    with camera_within(frames, rate=10.0) as live:
+        assert live.sensor == (3000, 4000)
         for _ in range(2):
             raw = live.read(timeout=10)
             np.testing.assert_array_equal(raw.frame, sent(frames, raw))
-        assert simulation.failure is None
 
 
 # --- vendors' producers -----------------------------------------------------------------------

@@ -179,6 +179,15 @@ def test_a_refusal_of_a_dead_camera_is_a_loss():
         opened(first).read()
 
 
+def test_a_refused_setting_is_forgotten():
+    first, second = Scripted([CameraLost("Gone.")]), Scripted([1])
+    first.set_gain = lambda value: (_ for _ in ()).throw(InputError("not while it rains"))
+    camera = opened(first, second, patience=5)
+    with pytest.raises(InputError, match="rains"):
+        camera.gain = 3.0
+    assert camera.read().metadata["gain"] == 0.0
+
+
 def test_a_camera_without_exposure():
     connection = Scripted([1])
     connection.exposures = connection.exposure = None

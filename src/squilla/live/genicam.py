@@ -242,7 +242,7 @@ class LiveCamera:
 
     def _set(self, name: str, value: Any) -> None:
         with self._lock:
-            older = self._settings.get(name)
+            before = dict(self._settings)
             self._settings[name] = value
             if self._gone:
                 return  # it is set when the camera is back
@@ -254,7 +254,7 @@ class LiveCamera:
             except CameraLost:
                 raise  # the reader brings the camera back, with the new value
             except InputError:
-                self._settings[name] = older
+                self._settings = before
                 self._read_back()  # it may have taken a part
                 raise
             if streaming:
@@ -471,8 +471,10 @@ class LiveCamera:
                 continue
             with self._lock:
                 try:
+                    if self._closed:
+                        raise loss
                     self._adopt(connection)
-                except CameraLost as error:
+                except InputError as error:  # gone again, or not fully awake
                     why = error
                     connection.close()
                     continue

@@ -122,7 +122,7 @@ class GentlConnection:
         If there is no such camera or producer, or another program controls the camera.
     """
 
-    buffers = 6
+    buffers = 8
 
     def __init__(self, name: str):
         self._acquirer: Any = None

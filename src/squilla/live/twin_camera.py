@@ -2,6 +2,8 @@
 
 import ctypes
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 from ctypes import POINTER, byref, c_char_p, c_int, c_size_t, c_uint32, c_uint64
 from ctypes import c_void_p as pointer
 from importlib.resources import files as package_files
@@ -13,6 +15,7 @@ import numpy as np
 from squilla.errors import InputError
 from squilla.live import aravis
 from squilla.live.connection import Region
+from squilla.live.genicam import LiveCamera
 from squilla.live.pixel_format import FORMATS
 from squilla.live.twin_frames import TwinFrames
 
@@ -26,6 +29,10 @@ _SIMULATOR = {
     "arv_fake_camera_read_register": (c_int, pointer, c_uint32, POINTER(c_uint32)),
     "arv_fake_camera_write_register": (c_int, pointer, c_uint32, c_uint32),
     "arv_fake_camera_write_memory": (c_int, pointer, c_uint32, c_uint32, c_char_p),
+    "arv_set_fake_camera_genicam_filename": (None, c_char_p),
+    "arv_fake_device_get_fake_camera": (pointer, pointer),
+    "arv_enable_interface": (None, c_char_p),
+    "arv_disable_interface": (None, c_char_p),
     "arv_buffer_get_data": (pointer, pointer, POINTER(c_size_t)),
     "arv_buffer_get_frame_id": (c_uint64, pointer),
     "g_object_unref": (None, pointer),
@@ -190,6 +197,31 @@ class TwinCamera:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@contextmanager
+def camera_within(frames: TwinFrames, *, rate: float = 5.0) -> Iterator[LiveCamera]:
+    """Open the twin as a camera inside this process, without any network.
+
+    Parameters
+    ----------
+    frames : TwinFrames
+    rate : float
+        Frames per second.
+    """
+    lib, path = simulator(), str(description()).encode()
+    lib.arv_set_fake_camera_genicam_filename(path)
+    lib.arv_enable_interface(b"Fake")
+    try:
+        connection = aravis.AravisConnection("Fake_1")
+    finally:
+        lib.arv_disable_interface(b"Fake")  # nobody else is to find it
+    inner = lib.arv_fake_device_get_fake_camera(connection.device)
+    simulation = Simulation(inner, frames, rate)
+    with LiveCamera(lambda: connection, None, 0.0, None) as camera:
+        yield camera
+    if simulation.failure is not None:
+        raise simulation.failure
 
 
 def simulator() -> SimpleNamespace:
