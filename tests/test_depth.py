@@ -24,9 +24,7 @@ def true_disparity(camera, depth):
 
 
 def captured(camera, scene, depth, snr=30.0):
-    return camera.capture(
-        scene, depth=depth, snr=snr, generator=torch.Generator().manual_seed(5)
-    )
+    return camera.capture(scene, depth=depth, snr=snr, generator=torch.Generator().manual_seed(5))
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +87,7 @@ def test_a_plain_surface_is_flagged(camera, calibration):
 
 
 def test_a_flat_scene_is_no_worse_off(camera, calibration, scene):
-    raw = camera.capture(
-        scene, distance=150.0, snr=30, generator=torch.Generator().manual_seed(6)
-    )
+    raw = camera.capture(scene, distance=150.0, snr=30, generator=torch.Generator().manual_seed(6))
     dense = measure(raw, calibration, depth=True)
     known = measure(raw, calibration, distance=150.0)
     both = dense.valid & known.valid

@@ -100,9 +100,7 @@ def demo(
             else:
                 scene, relief = load_scene(name, wavelength, size), None
             generator = torch.Generator().manual_seed(1000 * seed + number)
-            raw = twin.capture(
-                scene, distance=distance, depth=relief, snr=snr, generator=generator
-            )
+            raw = twin.capture(scene, distance=distance, depth=relief, snr=snr, generator=generator)
             path = folder / (f"raw-{name}.tiff" if number else "raw.tiff")
             write_raw(path, raw)
             raw = read_raw(path)

@@ -403,9 +403,7 @@ def _averaged(
     return both[0] / np.maximum(both[1], 1e-30)
 
 
-def _diffuse(
-    fields: np.ndarray, along: np.ndarray, down: np.ndarray, reach: float
-) -> np.ndarray:
+def _diffuse(fields: np.ndarray, along: np.ndarray, down: np.ndarray, reach: float) -> np.ndarray:
     """Smooth fields, (C, H, W), by three turns of rows and columns, each solved exactly."""
     for turn in range(3):
         strength = np.float32(1.5 * 4 ** (2 - turn) / (4**3 - 1) * reach**2)

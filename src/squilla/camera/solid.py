@@ -157,4 +157,3 @@ def _pattern(
     if kind == "stripes":
         return np.clip(0.5 + np.sin(2 * np.pi * v / size) + 0.2 * noise, 0, 1)
     return np.clip(0.5 + 0.35 * noise, 0, 1)
-

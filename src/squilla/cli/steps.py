@@ -50,7 +50,9 @@ def demo(
 
 
 def simulate(
-    scene: Annotated[str, typer.Argument(help="chart, indian-pines, corn-kernel, doll, or a file.")],
+    scene: Annotated[
+        str, typer.Argument(help="chart, indian-pines, corn-kernel, doll, or a file.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Raw frame to write.")],
     camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
     distance: Annotated[float, typer.Option(help="Of a plane scene, mm.")] = 300.0,
