@@ -1,7 +1,7 @@
 """Depth for every point, beside what a user would pick instead.
 
     pip install opencv-python-headless
-    python benchmarks/depth.py [--calibration camera.nc] [--figure docs/images/depth.webp]
+    python benchmarks/depth.py [--calibration camera.nc] [--figure docs/images/depth.webp] [--only doll]
 
 Captures solid scenes with the twin of the thesis' camera at 20 and 30 dB, finds their depth and
 judges it by the planted one. Every cell of the tables is written to
@@ -264,7 +264,8 @@ def compared(take: Take, snr: float) -> dict:
     views, noise = take.views(take.raws(snr)[0])
     baseline, rows = take.lattice.baseline, {}
     for name, method in METHODS.items():
-        method(take, views, noise)
+        if method is not patch_matching:  # nothing of it is compiled
+            method(take, views, noise)
         start = time.process_time()
         found = method(take, views, noise)
         seconds = time.process_time() - start
@@ -291,7 +292,7 @@ def compared(take: Take, snr: float) -> dict:
 
 
 def spectra(take: Take, snr: float) -> dict:
-    """Return the spectral error of whole cubes, however the sub-images were aligned."""
+    """Return the mean squared error of whole cubes over the mean square of the truth."""
     raw, plane = take.raws(snr)
     truth = take.camera.truth(take.scene, depth=take.depth).cube
     measurements = {
@@ -303,7 +304,8 @@ def spectra(take: Take, snr: float) -> dict:
     for model in ("ridge", "sparse"):
         reconstruct = load_model(model, take.calibration).reconstruct
         for name, measurement in measurements.items():
-            rows[name][model] = squilla.evaluate(reconstruct(measurement), truth)["mse"]
+            error = np.square(reconstruct(measurement).values - truth.values)
+            rows[name][model] = float(np.nanmean(error) / np.mean(np.square(truth.values)))
     return rows
 
 
@@ -354,9 +356,8 @@ def figure(take: Take, path: Path) -> None:
     corners = [0, 5, 30]
 
     def false_colour(y):
-        picture = np.stack(
-            [y[..., unit] / np.percentile(y[..., unit], 99.5) for unit in corners], -1
-        )
+        picture = y[..., corners]
+        picture = picture / np.percentile(picture, 99.5, axis=(0, 1))
         return np.clip(picture, 0, 1) ** (1 / 1.6)
 
     @styled
@@ -391,6 +392,7 @@ def main() -> None:
     options = argparse.ArgumentParser()
     options.add_argument("--calibration", type=Path)
     options.add_argument("--figure", type=Path)
+    options.add_argument("--only", default="", help="cells whose name begins so")
     given = options.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -404,20 +406,23 @@ def main() -> None:
             camera.design, dark=rehearsal.dark(), flat=rehearsal.flat(), sweep=rehearsal.sweep(),
             target=rehearsal.target(), target_distance=rehearsal.distance,
         )  # fmt: skip
-    scenes = {f"doll {seed}": (solid_scene, {"seed": seed}) for seed in (11, 12)}
-    scenes |= {f"layers {seed}": (layers_scene, {"seed": seed}) for seed in (11, 12, 13)}
+    scenes = {f"doll {seed}": (solid_scene, {"seed": seed}) for seed in (11,)}
+    scenes |= {f"layers {seed}": (layers_scene, {"seed": seed}) for seed in (11, 12)}
     cells = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     cells["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
 
     def cell(name: str, compute: Callable[[], dict]) -> None:
-        if name not in cells:
-            cells[name] = compute()
+        if name not in cells and name.startswith(given.only):
+            found = compute()
+            cells.update(json.loads(RESULTS.read_text()) if RESULTS.exists() else {})
+            cells[name] = found
             RESULTS.write_text(json.dumps(cells, indent=1) + "\n")
             print(name, json.dumps(cells[name]), flush=True)
 
     for name, (build, how) in scenes.items():
         wanted = [f"{name}, {snr} dB" for snr in (20, 30)] + [f"{name}, spectra"]
-        if all(each in cells for each in wanted) and not given.figure:
+        missing = [each for each in wanted if each not in cells and each.startswith(given.only)]
+        if not missing and not given.figure:
             continue
         take = Take(camera, calibration, *build(wavelength, **how), how["seed"])
         for snr in (20, 30):
@@ -428,7 +433,7 @@ def main() -> None:
             return
     for name in ("chart", "corn-kernel", "indian-pines"):
         cell(f"flat {name}", lambda name=name: flat(camera, calibration, name))
-    for distance in (100.0, 200.0, 400.0, 800.0):
+    for distance in (100.0, 200.0, 400.0):
         cell(f"doll at {distance:g} mm", lambda d=distance: ranged(camera, calibration, d))
     table(cells)
 
@@ -441,7 +446,7 @@ def table(cells: dict) -> None:
                     if name.startswith(f"{kind} ") and name.endswith(f", {snr} dB")]  # fmt: skip
             print(f"\n{kind}, {snr} dB, {len(some)} scenes")
             for method in some[0]:
-                keys = [key for key in some[0][method]]
+                keys = list(some[0][method])
                 means = {key: np.mean([each[method][key] for each in some]) for key in keys}
                 print(f"{method:<26}", "  ".join(f"{k} {v:.3g}" for k, v in means.items()))
     for name, each in cells.items():

@@ -1,6 +1,7 @@
 """Depth for every point: the twin plants it, the sweep finds it; its parts against brute force."""
 
-from itertools import product
+from dataclasses import replace
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -68,8 +69,6 @@ def test_hidden_channels_do_not_reach_the_cube(steps, calibration):
     spoiled = measurement.y.clone()
     spoiled[~measurement.valid] = 1e6
     model = load_model("ridge", calibration)
-    from dataclasses import replace
-
     clean = model.reconstruct(measurement).values
     np.testing.assert_allclose(
         model.reconstruct(replace(measurement, y=spoiled, snr=measurement.snr)).values, clean,
@@ -148,7 +147,7 @@ def test_paths_are_shortest_paths():
     best = np.full((5, 4), np.inf)
     for path in product(range(4), repeat=5):
         whole = sum(cost[0, x, k] for x, k in enumerate(path))
-        whole += sum(price[a, b] for a, b in zip(path, path[1:], strict=False))
+        whole += sum(price[a, b] for a, b in pairwise(path))
         for x, k in enumerate(path):
             best[x, k] = min(best[x, k], whole)
     # Six of the eight directions find nothing before them and add the bare cost.
