@@ -1,7 +1,7 @@
 """Depth for every point, beside what a user would pick instead.
 
     pip install opencv-python-headless
-    python benchmarks/depth.py [--calibration camera.nc] [--figure docs/images/depth.webp] [--only doll]
+    python benchmarks/depth.py [--calibration camera.nc] [--figure docs/images/depth.webp]
 
 Captures solid scenes with the twin of the thesis' camera at 20 and 30 dB, finds their depth and
 judges it by the planted one. Every cell of the tables is written to
@@ -444,6 +444,8 @@ def table(cells: dict) -> None:
         for snr in (20, 30):
             some = [each for name, each in cells.items()
                     if name.startswith(f"{kind} ") and name.endswith(f", {snr} dB")]  # fmt: skip
+            if not some:
+                continue
             print(f"\n{kind}, {snr} dB, {len(some)} scenes")
             for method in some[0]:
                 keys = list(some[0][method])

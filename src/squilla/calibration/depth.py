@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from torch import Tensor
 
 from squilla.calibration.calibration import Lattice
-from squilla.calibration.resample import CUBIC, resample
+from squilla.calibration.resample import CUBIC, SINC, resample
 
 if TYPE_CHECKING:
     from xarray import DataArray
@@ -134,7 +134,7 @@ def find_depth(
     inner = slice(views.margin, -views.margin)
     level = np.maximum(image[:, inner, inner].mean((1, 2)), 0) + 1e-6
     weight = (level / np.sqrt(noise)).astype(np.float32)
-    feature, gain = _gradients(views.image, noise)
+    feature, gain = _gradients(_unbent(views, lattice), noise)
     cost = np.empty((*lattice.field, count), np.float32)
     evidence = np.empty(lattice.field, np.float32)
     bell = _bell(_WINDOW)
@@ -159,6 +159,23 @@ def find_depth(
 
 
 # --- evidence ---------------------------------------------------------------------------------
+
+
+def _unbent(views: "SubImages", lattice: Lattice) -> Tensor:
+    """Return the sub-images as they were if all lenses imaged alike, so that planes only shift."""
+    if lattice.bend is None:
+        return views.image
+    size = views.image.shape[1:]
+    # The polynomial's y and x, -1..1 over the field, on pictures with their margin.
+    y, x = ((whole - 1) / (inner - 1) for whole, inner in zip(size, lattice.field, strict=True))
+    stretch = [y ** (order - b) * x**b for order in range(4) for b in range(order + 1)]
+    unbent = np.empty((1, *views.image.shape), np.float32)
+    resample(
+        views.image.numpy()[None], views.bad.numpy(),
+        lattice.places(np.zeros((len(lattice.bend), 2))) * stretch, 0 * lattice.baseline,
+        np.zeros(size, np.float32), SINC, unbent, np.empty(unbent.shape[1:], bool),
+    )  # fmt: skip
+    return torch.from_numpy(unbent[0])
 
 
 def _gradients(image: Tensor, noise: np.ndarray) -> tuple[np.ndarray, float]:
