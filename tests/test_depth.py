@@ -1,6 +1,7 @@
 """Depth for every point: the twin plants it, the sweep finds it; its parts against brute force."""
 
-from itertools import product
+from dataclasses import replace
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ import torch
 import xarray as xr
 
 from squilla.calibration import depth as room
-from squilla.calibration.alignment import measure
+from squilla.calibration.alignment import SubImages, measure
 from squilla.calibration.depth import Depth
 from squilla.calibration.rehearsal import poster
+from squilla.calibration.resample import monomials
 from squilla.camera import warp
 from squilla.camera.solid import solid_scene
 from squilla.errors import InputError
@@ -68,8 +70,6 @@ def test_hidden_channels_do_not_reach_the_cube(steps, calibration):
     spoiled = measurement.y.clone()
     spoiled[~measurement.valid] = 1e6
     model = load_model("ridge", calibration)
-    from dataclasses import replace
-
     clean = model.reconstruct(measurement).values
     np.testing.assert_allclose(
         model.reconstruct(replace(measurement, y=spoiled, snr=measurement.snr)).values, clean,
@@ -148,7 +148,7 @@ def test_paths_are_shortest_paths():
     best = np.full((5, 4), np.inf)
     for path in product(range(4), repeat=5):
         whole = sum(cost[0, x, k] for x, k in enumerate(path))
-        whole += sum(price[a, b] for a, b in zip(path, path[1:], strict=False))
+        whole += sum(price[a, b] for a, b in pairwise(path))
         for x, k in enumerate(path):
             best[x, k] = min(best[x, k], whole)
     # Six of the eight directions find nothing before them and add the bare cost.
@@ -166,6 +166,22 @@ def test_rows_are_solved_exactly():
     expected = np.linalg.solve(matrix, field[0, 0])
     room._along_rows(field, bond.astype(np.float32), np.float32(7.0))
     np.testing.assert_allclose(field[0, 0], expected, rtol=1e-4)
+
+
+def test_bent_views_are_straightened(calibration):
+    """On a ramp a point tells its own place: after unbending it is off by the polynomial."""
+    field, margin = calibration.lattice.field, 10
+    bend = 0.3 * np.random.default_rng(3).standard_normal((16, 2, 9))
+    lattice = replace(calibration.lattice, bend=bend)
+    rows, columns = np.mgrid[: field[0] + 2 * margin, : field[1] + 2 * margin].astype(np.float32)
+    for axis, ramp in enumerate((rows, columns)):
+        image = torch.from_numpy(np.repeat(ramp[None], 16, 0))
+        views = SubImages(image, torch.zeros(image.shape, dtype=torch.bool), np.zeros((16, 2)),
+                          margin, 0.0)  # fmt: skip
+        inner = slice(margin, -margin)
+        moved = (room._unbent(views, lattice).numpy() - ramp)[:, inner, inner]
+        expected = np.tensordot(bend[:, axis], monomials(*field)[1:], 1)
+        np.testing.assert_allclose(moved, expected, atol=2e-3)
 
 
 @pytest.mark.parametrize("baseline", [(0.0, 1.0), (0.0, -2.0), (1.0, 0.0), (2.0, 1.0)])

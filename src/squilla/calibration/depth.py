@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from torch import Tensor
 
 from squilla.calibration.calibration import Lattice
-from squilla.calibration.resample import CUBIC, resample
+from squilla.calibration.resample import CUBIC, SINC, resample
 
 if TYPE_CHECKING:
     from xarray import DataArray
@@ -40,6 +40,10 @@ _SLANT, _JUMP = 0.02, 1.0
 
 _SURE = 0.1
 """Expected standard deviation of the disparity, px per pitch, up to which a point is believed."""
+
+
+_LIMIT = 0.03
+"""Deviation that is left without noise, px per pitch, as benchmarks/depth.py finds it."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class Depth:
 
         told = {
             "depth": (self.distance, {"units": "mm", "long_name": "distance"}),
-            "depth_error": (self.error, {"units": "mm", "long_name": "expected standard deviation"}),
+            "depth_error": (self.error, {"units": "mm", "long_name": "standard deviation"}),
             "depth_confident": (
                 self.confident.to(torch.uint8), {"long_name": "1 where the texture suffices"}
             ),
@@ -104,8 +108,9 @@ def find_depth(
     disparity : array, (H, W) float32
         px per lens pitch.
     deviation : array, (H, W) float32
-        Its standard deviation, px per pitch: the Cramer-Rao bound of the texture in the window, or
-        what the smoothing moved it by, if that is more.
+        Its standard deviation, px per pitch: the Cramer-Rao bound of the texture in the window with
+        what slant and blur add; or, if that is more, what the smoothing moved it by, and beside a
+        jump half of it.
     seen : array, (H, W, M) bool
         False where something nearer hides the point from a unit.
 
@@ -129,7 +134,7 @@ def find_depth(
     inner = slice(views.margin, -views.margin)
     level = np.maximum(image[:, inner, inner].mean((1, 2)), 0) + 1e-6
     weight = (level / np.sqrt(noise)).astype(np.float32)
-    feature, gain = _gradients(views.image, noise)
+    feature, gain = _gradients(_unbent(views, lattice), noise)
     cost = np.empty((*lattice.field, count), np.float32)
     evidence = np.empty(lattice.field, np.float32)
     bell = _bell(_WINDOW)
@@ -146,11 +151,31 @@ def find_depth(
     spread = (share @ (lattice.baseline - share @ lattice.baseline) ** 2).mean()
     pixels = 4 * np.pi * (_SMOOTH**2 + _WINDOW**2)
     deviation = 1 / np.sqrt(np.maximum(evidence, 1e-3) * gain * spread * pixels)
-    deviation = np.maximum(deviation, np.abs(rough - disparity)).astype(np.float32)
+    jump = (maximum_filter(disparity, 5) - minimum_filter(disparity, 5)) / 2
+    deviation = np.maximum.reduce(
+        [np.hypot(deviation, _LIMIT), np.abs(rough - disparity), jump]
+    ).astype(np.float32)
     return disparity, deviation, _seen(disparity, lattice.baseline)
 
 
 # --- evidence ---------------------------------------------------------------------------------
+
+
+def _unbent(views: "SubImages", lattice: Lattice) -> Tensor:
+    """Return the sub-images as they were if all lenses imaged alike, so that planes only shift."""
+    if lattice.bend is None:
+        return views.image
+    size = views.image.shape[1:]
+    # The polynomial's y and x, -1..1 over the field, on pictures with their margin.
+    y, x = ((whole - 1) / (inner - 1) for whole, inner in zip(size, lattice.field, strict=True))
+    stretch = [y ** (order - b) * x**b for order in range(4) for b in range(order + 1)]
+    unbent = np.empty((1, *views.image.shape), np.float32)
+    resample(
+        views.image.numpy()[None], views.bad.numpy(),
+        lattice.places(np.zeros((len(lattice.bend), 2))) * stretch, 0 * lattice.baseline,
+        np.zeros(size, np.float32), SINC, unbent, np.empty(unbent.shape[1:], bool),
+    )  # fmt: skip
+    return torch.from_numpy(unbent[0])
 
 
 def _gradients(image: Tensor, noise: np.ndarray) -> tuple[np.ndarray, float]:

@@ -147,10 +147,10 @@ def _pattern(
     if kind == "hair":
         noise = gaussian_filter(random.standard_normal(u.shape), (3 * pixels, 0.3 * pixels))
     else:
-        noise = sum(
-            gaussian_filter(random.standard_normal(u.shape), scale * pixels) * scale
-            for scale in (0.35, 1.0)
+        fine, coarse = (
+            gaussian_filter(random.standard_normal(u.shape), scale * pixels) for scale in (0.35, 1)
         )
+        noise = 0.35 * fine + coarse
     noise = noise / noise.std()
     if kind == "grain":  # little contrast, as skin and plaster have
         return np.clip(0.3 + 0.25 * noise, 0, 1)
