@@ -150,6 +150,19 @@ def test_solvers_explain_the_measurement(solver, spectra):
     assert rest.norm() < 0.05 * y.norm()
 
 
+@pytest.mark.parametrize("name", NETWORKS)
+def test_networks_see_what_the_mean_sensitivity_would_measure(name, spectra):
+    """At the ends of the field the rest is a fifth of what the tilt had changed."""
+    network = untrained(name)
+    mean = CAMERA.project(spectra)
+    for end in CAMERA.angle[[0, -1]]:
+        angle = torch.full((24,), float(end))
+        y = CAMERA.project(spectra, angle)
+        left = network.levelled(y, angle) - mean
+        assert left.norm() < 0.2 * (y - mean).norm()
+    assert network.levelled(mean, None) is mean
+
+
 # --- the scale of a network -----------------------------------------------------------------
 
 
