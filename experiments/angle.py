@@ -1,14 +1,16 @@
 """Corner of the field against its centre: what it costs to ignore the angle, and what mends it.
 
-    python experiments/angle.py CALIBRATION [--frames]
+    python experiments/angle.py [FOLDER] [--frames]
 
-CALIBRATION is a camera.nc that was learnt from the twin of the thesis' camera, such as
-build/sensitivity/sweep, 5 nm steps.nc by experiments/sensitivity.py. Point spectra are measured by
-the stack's exact response at the exact angle, averaged over the F/4 cone, with white noise. They
-are reconstructed with four sensitivities: that of the axis everywhere; the same shifted by one
-effective index and averaged over the cone; what the calibration learnt in each zone; the true one.
-All four know the vignetting. With --frames whole frames of the twin are taken too, where blur and
-vignetting have their share. Writes experiments/results/angle.json and docs/images/angle.webp.
+Needs the calibration "sweep, 2.5 nm steps" that experiments/sensitivity.py left in FOLDER (default:
+build/sensitivity), learnt from the twin of the thesis' camera with pixels of twice the size.
+
+Point spectra are measured by the stack's exact response at the exact angle, averaged over the F/4
+cone, with white noise. They are reconstructed with four sensitivities: that of the axis everywhere;
+the same shifted by one effective index and averaged over the cone; what the calibration learnt in
+each zone; the true one. All four know the vignetting. With --frames whole frames of the twin are
+taken too, where blur has its share. Writes experiments/results/angle.json and
+docs/images/angle.webp.
 """
 
 import argparse
@@ -18,13 +20,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from sensitivity import halved
 
 import squilla
 from squilla.calibration.calibration import Calibration
 from squilla.camera.design import Effects
 from squilla.camera.lens import cone
-from squilla.camera.scenes import load_scene
 from squilla.evaluation.style import COLOURS, INK, canvas, styled
+from squilla.files.cube import labelled
 from squilla.optics.angle import fit_effective_index
 from squilla.optics.merit import Prior, WhiteNoise, estimator_error, wiener
 from squilla.reconstruction.reconstructor import load_model
@@ -40,11 +43,11 @@ HOW = ("axis everywhere", "axis, shifted", "learnt in zones", "true")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("calibration", type=Path)
+    parser.add_argument("folder", type=Path, nargs="?", default="build/sensitivity")
     parser.add_argument("--frames", action="store_true")
     options = parser.parse_args()
-    camera = squilla.Camera("thesis")
-    learnt = squilla.load_calibration(options.calibration)
+    camera = squilla.Camera(halved(squilla.CameraDesign.load("thesis")))
+    learnt = squilla.load_calibration(options.folder / "sweep, 2.5 nm steps.nc")
     cameras = known(camera, learnt)
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     results |= {
@@ -204,14 +207,11 @@ def frames(camera: squilla.Camera, learnt: Calibration) -> dict:
 
 
 def tiles(camera: squilla.Camera):
-    """Return a scene of 25 px tiles of natural spectra, the same in the middle and the corners."""
-    scene = load_scene("chart", camera.design.wavelength, 350)
-    pick = PRIORS["natural"](
-        25, camera.design.wavelength, generator=torch.Generator().manual_seed(8)
-    )
-    block = np.arange(25).reshape(5, 5)
-    labels = np.kron(np.tile(block, (3, 3)), np.ones((25, 25), int))[12:362, 12:362]
-    return scene.copy(data=pick.numpy()[labels])
+    """Return a scene of 12 px tiles of natural spectra, the same in the middle and the corners."""
+    wavelength, size = camera.design.wavelength, camera.design.field.size + 52
+    pick = PRIORS["natural"](25, wavelength, generator=torch.Generator().manual_seed(8)).numpy()
+    number = np.arange(size) // 12 % 5
+    return labelled(pick[5 * number[:, None] + number], wavelength)
 
 
 # --- what is shown ----------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from squilla.camera.design import design_path
 from squilla.cli.app import app
-from squilla.cli.steps import read_depth, read_sweep
+from squilla.cli.steps import read_depth, read_known, read_sweep
 from squilla.errors import InputError
 
 SMALL = {
@@ -73,6 +73,27 @@ def test_from_raw_frame_to_verdict(bench, tmp_path):
     assert metrics == json.loads((tmp_path / "verdict" / "metrics.json").read_text())
     assert metrics["gfc"] > 0.9
     assert "<html" in (tmp_path / "verdict" / "report.html").read_text()
+
+
+def test_a_chart_and_lamps_instead_of_a_sweep(bench, tmp_path):
+    run(
+        "rehearse", "-o", tmp_path, "--camera", bench / "small.toml", "--frames", 2, "--known",
+        "--step", 50,
+    )  # fmt: skip
+    printed = run(
+        "calibrate", "--camera", bench / "small.toml", "--dark", tmp_path / "dark",
+        "--flat", tmp_path / "flat", "--known", tmp_path / "known", "-o", tmp_path / "c.nc",
+        "--json",
+    )  # fmt: skip
+    learnt = json.loads(printed)
+    assert learnt["known_spectra"] == 120
+    assert 1 < learnt["effective_index"] < 3
+    (tmp_path / "known" / "labels.png").write_text("no picture")
+    with pytest.raises(InputError, match="labels"):
+        next(iter(read_known(tmp_path / "known", np.array([500.0, 750.0]))))
+    (tmp_path / "known" / "known.csv").write_text("file,spectra,labels\n000.tiff,000.txt,x\n")
+    with pytest.raises(InputError, match="line 2"):
+        read_known(tmp_path / "known", np.array([500.0, 750.0]))
 
 
 def test_several_frames_go_into_a_folder(bench, tmp_path):

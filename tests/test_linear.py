@@ -1,12 +1,14 @@
 """The Wiener estimator against its closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from random_camera import smooth_camera
 from squilla.calibration.calibration import Calibration
-from squilla.reconstruction.linear import Ridge, complete, second_moment
+from squilla.reconstruction.linear import Ridge, complete, model_error, second_moment
 from squilla.spectra import broad_spectra
 
 
@@ -100,3 +102,30 @@ def test_pixels_with_too_few_channels_become_nan(camera):
     filled = complete(y, valid, camera)
     assert filled.isfinite().all(-1).tolist() == [True, False, True]
     torch.testing.assert_close(filled[0], y[0])
+
+
+def test_an_uncertain_sensitivity_is_noise_of_its_own():
+    """With R drawn from its errors, the estimator that knows them is nearly the best linear one."""
+    camera = smooth_camera(0, filters=16, bands=51)
+    random = np.random.default_rng(1)
+    drawn = 0.03 * camera.sensitivity.mean() * random.standard_normal((40, 1, 16, 51))
+    unsure = replace(camera, deviations=drawn)
+    moment = second_moment(camera)
+    x = broad_spectra(4000, camera.wavelength, generator=torch.Generator().manual_seed(1))
+    which = torch.from_numpy(random.integers(40, size=4000))
+    true = camera.sensitivities[0] + torch.from_numpy(drawn[:, 0]).float()[which]
+    y = torch.einsum("nmk,nk->nm", true, x)
+    y = y + 1e-3 * y.square().mean(-1, keepdim=True).sqrt() * torch.randn(
+        y.shape, generator=torch.Generator().manual_seed(2)
+    )
+    errors = [
+        float(
+            (Ridge(each, moment).estimate(y, None, torch.full((4000,), 60.0)) - x).square().mean()
+        )
+        for each in (camera, unsure)
+    ]
+    best = torch.linalg.lstsq(y.double(), x.double()).solution  # fitted to these very spectra
+    least = float((y.double() @ best - x).square().mean())
+    assert errors[1] < 1.1 * least
+    assert errors[0] > 1.1 * errors[1]
+    assert model_error(camera, moment).abs().max() == 0

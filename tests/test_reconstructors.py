@@ -159,6 +159,19 @@ def test_solvers_explain_the_measurement(solver, spectra):
     assert rest.norm() < 0.05 * y.norm()
 
 
+def test_networks_see_what_the_mean_sensitivity_would_measure():
+    """At the ends of the field, with 36 filters, hardly more than half of the tilt's change is left."""
+    camera = smooth_camera(0, filters=36, bands=48, angles=3)
+    spectra = broad_spectra(200, camera.wavelength, generator=torch.Generator().manual_seed(3))
+    network, mean = untrained("mlp", camera), camera.project(spectra)
+    for end in camera.angle[[0, -1]]:
+        angle = torch.full((200,), float(end))
+        y = camera.project(spectra, angle)
+        left = network.levelled(y, angle) - mean
+        assert left.norm() < 0.6 * (y - mean).norm()
+    assert network.levelled(mean, None) is mean
+
+
 # --- the scale of a network -----------------------------------------------------------------
 
 

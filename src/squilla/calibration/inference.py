@@ -230,7 +230,7 @@ def _volume(covariance: np.ndarray) -> float:
 
 
 def _kernel(wavelength: np.ndarray, length: float, size: float) -> np.ndarray:
-    """Return the covariance of a smooth row of R, (K, K): a level of 1 and Matern's of order 7/2."""
+    """Return the covariance of a smooth row of R, (K, K): a level, and Matern's of order 7/2."""
     wavenumber = 1 / np.asarray(wavelength, float)
     apart = np.abs(wavenumber[:, None] - wavenumber) / np.ptp(wavenumber)
     x = np.sqrt(7) / length * apart

@@ -84,7 +84,7 @@ def known_responses(
         for surface in range(kinds):
             chosen = torch.from_numpy(inside & (scene.labels == surface))
             y, valid = measurement.y[chosen].double(), measurement.valid[chosen]
-            if int(valid.sum(0).min()) < 9:
+            if int(valid.sum(0).min()) < 4:
                 continue
             measured.append(((y * valid).sum(0) / valid.sum(0)).numpy())
             spectra.append(scene.spectra[surface])

@@ -226,23 +226,35 @@ def sweep_sensitivity(sweep: Responses, grid: np.ndarray) -> tuple[Inferred, dic
     middle, light, response = sweep.wavelength[~outside], light[~outside], response[~outside]
     _check_cover(middle, grid)
     found = infer_sensitivity(light, response, grid)
-    size = np.abs(found.power_error)
-    doubted = size > max(0.05, 10 * float(np.median(size)))
-    if doubted.sum() > max(2, 0.1 * len(doubted)):
+    doubted: list[int] = []
+    while (worst := _misread(found.power_error)) is not None:
+        doubted.append(np.delete(np.arange(len(middle)), doubted)[worst])
+        if len(doubted) > max(2, 0.1 * len(middle)):
+            raise InputError(
+                f"More than {len(doubted) - 1} steps of the sweep contradict the others in all "
+                f"filters at once, that at {middle[doubted[0]]:g} nm first; check their powers."
+            )
+        good = np.delete(np.arange(len(middle)), doubted)
+        _check_cover(middle[good], grid)
+        found = infer_sensitivity(light[good], response[good], grid)
+    if found.power_noise > 0.1:
         raise InputError(
-            f"{doubted.sum()} steps of the sweep contradict the others, that at "
-            f"{middle[doubted][0]:g} nm for one, in all filters at once; check their powers."
+            f"The filters together say that the powers of the sweep are wrong by "
+            f"{100 * found.power_noise:.0f} % from step to step; check the table of the sweep."
         )
-    if doubted.any():
-        _check_cover(middle[~doubted], grid)
-        found = infer_sensitivity(light[~doubted], response[~doubted], grid)
     return found, {
         "saturated_steps": _listed(sweep.saturated),
-        "doubted_steps": _listed(middle[doubted]),
+        "doubted_steps": _listed(middle[sorted(doubted)]),
         "power_noise": found.power_noise,
         "power_drift": drift,
         "stray_light": stray,
     }
+
+
+def _misread(power_error: np.ndarray) -> int | None:
+    """Return the step whose power was misread most grossly; None where none stands out."""
+    size = np.abs(power_error)
+    return int(size.argmax()) if size.max() > max(0.05, 10 * float(np.median(size))) else None
 
 
 def gaussian_bands(wavelength: np.ndarray, bandwidth: np.ndarray, grid: np.ndarray) -> np.ndarray:
