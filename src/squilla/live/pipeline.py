@@ -177,10 +177,11 @@ class LiveSource:
                     continue
                 self._publish(raw, taken)
                 self._trouble = None
-            except (
-                InputError
-            ) as error:  # a dark frame, a camera that was unplugged: told, not fatal
+            except InputError as error:  # a dark frame, a lost camera: told, not fatal
                 self._tell(str(error))
+            except Exception as error:  # a fault of ours: the view goes on and says so
+                traceback.print_exc()
+                self._tell(f"A frame could not be shown ({type(error).__name__}: {error}).")
 
     def _waits(self) -> bool:
         """Tell whether the frame just read is not to be shown."""

@@ -173,10 +173,13 @@ class _Clock:
     """Ticks at a rate; who comes late is told how many ticks passed by."""
 
     def __init__(self, rate: float):
-        self._period, self._start, self._last = 1 / rate, time.monotonic(), -1
+        self._period, self._last = 1 / rate, -1
+        self._start: float | None = None
 
     def wait(self) -> tuple[int, int]:
         """Sleep until a tick that was not waited for yet; returns its number and those missed."""
+        if self._start is None:
+            self._start = time.monotonic()
         due = self._start + (self._last + 1) * self._period
         time.sleep(max(0.0, due - time.monotonic()))
         tick = max(int((time.monotonic() - self._start) / self._period), self._last + 1)

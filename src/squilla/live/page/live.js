@@ -119,7 +119,7 @@ export class Live {
     const [first, last] = [this.times[0], this.times.at(-1)];
     const shown = this.times.length > 1 ? (this.times.length - 1) / (last - first) * 1000 : null;
     const { frame, measure, reconstruct } = told.stages ?? {};
-    const ms = (value) => (value === undefined ? "–" : `${Math.round(value)}`);
+    const ms = (value) => (value === undefined ? "–" : `${Math.round(value)} ms`);
     const facts = [
       ["Shown", shown === null ? "–" : `${shown.toFixed(1)} /s`],
       ["Measured", told.rate === null ? "–" : `${told.rate.toFixed(1)} /s`],
@@ -128,11 +128,13 @@ export class Live {
       ["Alignment", told.alignment.toFixed(2), told.alignment < 0.1],
       ["Distance", `${Math.round(told.distance)} mm`],
       ["SNR", `${told.snr.toFixed(1)} dB`],
-      ["Frame, measure, cube", `${ms(frame)}, ${ms(measure)}, ${ms(reconstruct)} ms`],
+      ["Exposure", told.exposure === null ? "–" : `${short(told.exposure, 3)} ms`],
+      ["Frame", ms(frame)],
+      ["Measure", ms(measure)],
+      ["Cube", ms(reconstruct)],
     ];
-    $("facts").replaceChildren(...facts.flatMap(([name, value, bad]) => [
-      element("dt", {}, name), element("dd", { className: bad ? "bad" : "" }, value),
-    ]));
+    $("facts").replaceChildren(...facts.map(([name, value, bad]) => element("div", {},
+      element("dt", {}, name), element("dd", { className: bad ? "bad" : "" }, value))));
     this.trouble(told.error ?? told.record_error);
   }
 }
