@@ -269,8 +269,8 @@ def sharpness(weights: Path | None, size: int = 128) -> dict[str, float]:
             with torch.inference_mode():
                 x = model(y, snr=float(snr))
             # Only bands in which the two sides differ have an edge.
-            contrast = (surface[0] - surface[1]).abs() / surface.amax(0)
-            bands = [band for band in (25, 75, 125, 175, 225) if contrast[band] > 0.3]
+            contrast = (surface[0] - surface[1]).abs() / surface.max()
+            bands = [band for band in (25, 75, 125, 175, 225) if contrast[band] > 0.1]
             clean = mtf50(home.project(truth).mean(-1).numpy(), distance)
             ratios += [mtf50(x[..., band].numpy(), distance) / clean for band in bands]
         result[f"MTF50 of bands over the measurement's, {snr} dB"] = float(np.median(ratios))
