@@ -8,10 +8,10 @@ from scipy.stats import multivariate_normal, norm
 from random_camera import smooth_camera
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
-from squilla.reconstruction.compound import (
+from squilla.reconstruction.compound import Compound
+from squilla.reconstruction.evidence import (
     TOLD,
     Camera,
-    Compound,
     View,
     _telling,
     coarser,

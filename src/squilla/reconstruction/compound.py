@@ -1,18 +1,16 @@
 """One model for every camera: exact estimates at several scales, then a small network.
 
-A front end that nobody trained turns the measurement of any calibrated camera into coefficients of
-a fixed basis of spectra. It averages each pixel with the neighbours that, at the known noise, show
-the same spectrum; so most pixels are far less noisy than they were measured. The posterior of a
-mixture of Gaussians then gives the spectrum and its variance. A small convolutional network behind
-it has learnt, over many random cameras, scenes and noises, what is left to be mended, and how far
-the result may be off. `docs/compound.md` tells the whole story.
+A front end that nobody trained (`evidence`) turns the measurement of any calibrated camera into
+posteriors of the coefficients of a fixed basis of spectra. A small convolutional network behind it
+has learnt, over many random cameras, scenes and noises, what is left to be mended, and how far the
+result may be off. `docs/compound.md` tells the whole story.
 
 Pictures are (B, H, W, channels); level l has cells of 2^l px.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,26 +20,20 @@ from torch.nn import functional
 
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
-from squilla.reconstruction.prior import Estimators, Prior, broad_prior
+from squilla.reconstruction.evidence import (
+    CORRECTED,
+    LEVELS,
+    Camera,
+    Evidence,
+    gather_evidence,
+    inherit,
+    noise_factor,
+)
+from squilla.reconstruction.prior import Prior, broad_prior
 from squilla.reconstruction.reconstructor import Reconstructor, Scale, check_scale, picture
 
 if TYPE_CHECKING:
     from xarray import DataArray
-
-LEVELS = 4
-"""Halvings from the picture to the coarsest cells."""
-
-SPECTRAL = 2
-"""Level at which spectra are inferred; finer ones borrow from it."""
-
-DIRECTIONS = 32
-"""Directions of the channels that are kept: what others see of spectra is below 60 dB."""
-
-TOLD = 12
-"""Leading directions by which two measurements are told apart."""
-
-CORRECTED = (16, 32)
-"""Leading coefficients that cells of levels 0 and 1 know something of by themselves."""
 
 KNOTS = 51
 """Wavelengths at which the interval is predicted; linear in between."""
@@ -49,355 +41,11 @@ KNOTS = 51
 ZONES = 8
 """Zones of field angle, equal in area, each of which has estimators of its own."""
 
-MODEL_NOISE = 1e-5
-"""What calibrations are wrong by, as a share of the signal's power: 50 dB."""
-
 UNKNOWN = 20.0
 """Signal-to-noise ratio where none is given, dB."""
 
 SMALLEST = 16
 """Side of a picture, px, from which on its own noise is measured in it."""
-
-
-class Camera:
-    """What the front end must know of a camera.
-
-    Parameters
-    ----------
-    response : Tensor, (A, M, K)
-        One matrix for each zone of field angles.
-    prior : Prior
-        On the same wavelengths.
-    """
-
-    def __init__(self, response: Tensor, prior: Prior):
-        response = response.double()
-        mean = response.mean(0)
-        white = mean.sum(-1)
-        flat = white / (white @ white)
-        seen = mean @ prior.basis
-        unit = white.square().mean().sqrt()
-        vectors = torch.linalg.eigh(seen @ prior.moment @ seen.T)[1].flip(1)
-        kept = torch.zeros(len(white), DIRECTIONS, dtype=torch.float64)
-        kept[:, : len(white)] = vectors[:, :DIRECTIONS]
-        self.project = torch.cat([kept / unit, flat[:, None]], 1).float()
-        """(M, DIRECTIONS + 1), y @ project is amplitude times shape in the directions kept, and
-        the amplitude. A flat spectrum of one has an amplitude of one and a shape of rms one."""
-        self.channels = len(white)
-        self.zones = [
-            Estimators(kept.T @ one / unit, flat @ one, len(white), prior) for one in response
-        ]
-        """The posteriors, zone by zone."""
-        seen = kept[:, :TOLD].T @ seen / unit
-        moment = prior.moment * (len(white) / (seen @ prior.moment @ seen.T).trace())
-        self.power = (seen @ moment @ seen.T).diagonal().clamp_min(1e-12).float()
-        """(TOLD,), variance of shapes in the leading directions."""
-        self.quiet = vectors[:, -(len(white) // 2) :].float()
-        """(M, M // 2), directions that hardly any spectrum reaches: what they see is noise."""
-
-    def to(self, device: torch.device | str) -> "Camera":
-        """Move everything to a device, in place."""
-        for name in ("project", "power", "quiet"):
-            setattr(self, name, getattr(self, name).to(device))
-        for zone in self.zones:
-            zone.to(device)
-        return self
-
-
-@dataclass
-class View:
-    """The measurement at one level: what cells measure, and how sure that is.
-
-    shape : (B, H, W, D) measurements divided by their amplitude, in the camera's directions.
-    noise : (B, H, W) noise variance of each direction.
-    amplitude : (B, H, W).
-    """
-
-    shape: Tensor
-    noise: Tensor
-    amplitude: Tensor
-
-    def joined(self, size: int) -> Tensor:
-        """Return what is averaged together, (B, H, W, size + 2), of `size` directions."""
-        return torch.cat(
-            [self.shape[..., :size], self.noise[..., None], self.amplitude[..., None]], -1
-        )
-
-    @classmethod
-    def parted(cls, joined: Tensor) -> "View":
-        """Undo `joined`."""
-        return cls(joined[..., :-2], joined[..., -2], joined[..., -1])
-
-
-# --- averaging over what looks the same ---------------------------------------------------------
-
-
-def coarser(view: View) -> View:
-    """Average cells two by two, each weighted by its certainty; sides must be even."""
-    b, h, w, _ = view.shape.shape
-
-    def total(values: Tensor) -> Tensor:
-        return values.view(b, h // 2, 2, w // 2, 2, -1).sum((2, 4))
-
-    weight = 1 / view.noise[..., None]
-    summed = total(weight)
-    amplitude = total(view.amplitude[..., None] * weight) / summed
-    return View(total(view.shape * weight) / summed, 1 / summed[..., 0], amplitude[..., 0])
-
-
-def among_neighbours(view: View, camera: Camera) -> View:
-    """Average each cell with those of its eight neighbours that show the same spectrum."""
-    h, w, size = view.shape.shape[1:]
-    weight = 1 / view.noise
-    told = view.shape[..., :TOLD]
-    # Neighbours are about as noisy as the cell itself.
-    scale, against = _telling(2 * (view.noise + MODEL_NOISE), camera)
-    content = torch.cat([view.shape, view.amplitude[..., None]], -1)
-    around = functional.pad(torch.cat([content, weight[..., None]], -1), (0, 0, 1, 1, 1, 1))
-    total = content * weight[..., None]
-    for dy, dx in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
-        other = around[:, dy : dy + h, dx : dx + w]
-        differ = ((other[..., :TOLD] - told).square() * scale).sum(-1) - against
-        share = torch.sigmoid(-differ) * other[..., -1]
-        total = torch.addcmul(total, share[..., None], other[..., : size + 1])
-        weight = weight + share
-    total = total / weight[..., None]
-    return View(total[..., :size], 1 / weight, total[..., size])
-
-
-def kinship(view: View, own: View, coarse: View, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return how much each cell takes from the four coarse cells around it, and from itself.
-
-    The likelihoods that a cell shows the spectrum of a coarse one, times how certain that is.
-
-    Parameters
-    ----------
-    view : View
-        What the cells measured.
-    own : View
-        What they know without the coarse level; its certainty counts for "itself".
-    coarse : View
-        Half the size.
-
-    Returns
-    -------
-    kin : Tensor, (B, H, W, 4)
-        Shares of the coarse cells, summing to 1, in the order of `inherit`.
-    alone : Tensor, (B, H, W)
-        Log odds of the cell itself against all of them.
-    """
-    told = view.shape[..., :TOLD]
-    around = _edged(torch.cat([coarse.shape[..., :TOLD], coarse.noise[..., None]], -1))
-    mean = functional.avg_pool2d(around[..., -1], 2, 1)  # of the four around each corner
-    phases = []
-    for (y, x), phase, cells in _four(*view.noise.shape[1:]):
-        h, w = coarse.noise.shape[1:]
-        noise = view.noise[phase] + mean[:, y : y + h, x : x + w]
-        scale, against = _telling(noise + 2 * MODEL_NOISE, camera)
-        logs = []
-        for cell in cells:
-            other = around[cell]
-            differ = ((other[..., :-1] - told[phase]).square() * scale).sum(-1) - against
-            logs.append(-differ - (other[..., -1] + MODEL_NOISE).log())
-        logs = torch.stack(logs, -1)
-        alone = -(own.noise[phase] + MODEL_NOISE).log() - torch.logsumexp(logs, -1)
-        phases.append(torch.cat([torch.softmax(logs, -1), alone[..., None]], -1))
-    both = _interleaved(phases)
-    return both[..., :4], both[..., 4]
-
-
-def _telling(noise: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return scale (..., TOLD) and constant (...): how to tell two spectra apart.
-
-    The sum of squared differences times scale, less the constant, is how much likelier two
-    measurements are of different spectra than of one, as a logarithm. `noise` is the variance of
-    their difference.
-
-    Source: Neyman and Pearson; N(0, noise) against N(0, noise + 2 power).
-    """
-    share = 2 * camera.power / noise[..., None]
-    return share / (1 + share) / (2 * noise[..., None]), torch.log1p(share).sum(-1) / 2
-
-
-def inherit(kin: Tensor, coarse: Tensor) -> Tensor:
-    """Mix the four coarse cells, (B, H/2, W/2, C), around each cell, (B, H, W, 4)."""
-    around = _edged(coarse)
-    phases = []
-    for _, phase, cells in _four(*kin.shape[1:3]):
-        part = kin[phase]
-        mixed = part[..., :1] * around[cells[0]]
-        for number in range(1, 4):
-            mixed = torch.addcmul(mixed, part[..., number : number + 1], around[cells[number]])
-        phases.append(mixed)
-    return _interleaved(phases)
-
-
-def _edged(picture: Tensor) -> Tensor:
-    """Repeat the outermost cells once around a picture."""
-    wide = torch.cat([picture[:, :, :1], picture, picture[:, :, -1:]], 2)
-    return torch.cat([wide[:, :1], wide, wide[:, -1:]], 1)
-
-
-def _four(height: int, width: int):
-    """Yield the four phases of cells in a coarse one: number, place, its nearest coarse cells."""
-    h, w = height // 2, width // 2
-    every = slice(None)
-    for y in range(2):
-        for x in range(2):
-            near = [
-                (every, slice(row, row + h), slice(column, column + w))
-                for row in (y, y + 1)
-                for column in (x, x + 1)
-            ]
-            yield (y, x), (every, slice(y, None, 2), slice(x, None, 2)), near
-
-
-def _interleaved(phases: list[Tensor]) -> Tensor:
-    """Undo the parting of a picture into four phases."""
-    b, h, w, c = phases[0].shape
-    rows = [torch.stack(phases[2 * row : 2 * row + 2], 3) for row in range(2)]
-    return torch.stack(rows, 2).view(b, 2 * h, 2 * w, c)
-
-
-# --- the front end ------------------------------------------------------------------------------
-
-
-@dataclass
-class Evidence:
-    """Everything that the front end hands on, of the same size for every camera.
-
-    coefficients, variance : (B, H, W, C) at the level SPECTRAL, posterior mean and variance.
-    features : (B, H, W, 2) there: log noise and log evidence.
-    kin, alone : of `kinship` for the levels below, finest first.
-    own : what the cells of these levels say by themselves, (B, H, W, CORRECTED[level]).
-    noise : noise variance of that, (B, H, W).
-    amplitude : (B, H, W) as measured; smooth : the same averaged over kin.
-    """
-
-    coefficients: Tensor
-    variance: Tensor
-    features: Tensor
-    kin: list[Tensor]
-    alone: list[Tensor]
-    own: list[Tensor]
-    noise: list[Tensor]
-    amplitude: Tensor
-    smooth: Tensor
-
-
-def gather_evidence(
-    y: Tensor, ratio: Tensor, camera: Camera, levels: int, zone: Tensor | None = None
-) -> Evidence:
-    """Turn measurements into posteriors.
-
-    Parameters
-    ----------
-    y : Tensor, (B, H, W, M)
-        Sides must be multiples of 2^levels.
-    ratio : Tensor, (B, H, W)
-        Noise power over signal power; infinite where nothing was measured.
-    camera : Camera
-    levels : int
-        0 for pixels without neighbours.
-    zone : Tensor, (B, H, W), int, optional
-        Number of each pixel's zone; a camera of one zone needs none.
-    """
-    projected = y @ camera.project
-    amplitude = projected[..., -1]
-    floor = 1e-3 * amplitude.abs().mean((1, 2), keepdim=True)
-    amplitude = torch.maximum(amplitude, floor).clamp_min(1e-30)
-    shape = projected[..., :-1] / amplitude[..., None]
-    power = shape.square().sum(-1) / camera.channels
-    views = [View(shape, (ratio * power.clamp_min(1e-6)).clamp(1e-9, 1e6), amplitude)]
-    for _ in range(levels):
-        views.append(coarser(views[-1]))
-    known = [views[0], *(among_neighbours(view, camera) for view in views[1:])]
-    lowest = min(SPECTRAL, levels)
-    best = spectral = known[-1]
-    kin, alone = [], []
-    for level in reversed(range(levels)):
-        shares, odds = kinship(views[level], known[level], best, camera)
-        if level < lowest:
-            kin.insert(0, shares)
-            alone.insert(0, odds)
-        if level == 0:
-            break
-        size = DIRECTIONS if level >= lowest else TOLD
-        inherited = inherit(shares, best.joined(size))
-        itself = torch.sigmoid(odds)[..., None]
-        best = View.parted(torch.lerp(inherited, known[level].joined(size), itself))
-        if level == lowest:
-            spectral = best
-    smooth = inherit(kin[0], best.amplitude[..., None])[..., 0] if levels else amplitude
-
-    def estimated(level: int, view: View, estimate):
-        return _by_zone(
-            estimate, camera.zones, _coarse_zone(zone, 2**level), view.shape,
-            view.noise + MODEL_NOISE,
-        )  # fmt: skip
-
-    mean, variance, evidence = estimated(lowest, spectral, Estimators.mixture)
-    own = [
-        estimated(
-            level, known[level],
-            lambda one, shape, noise, size=CORRECTED[level]: (one.wiener(shape, noise, size),),
-        )[0]
-        for level in range(lowest)
-    ]  # fmt: skip
-    noise = (spectral.noise + MODEL_NOISE).log()
-    return Evidence(
-        mean,
-        variance,
-        torch.stack([noise, evidence.clamp(-20, 20)], -1),
-        kin,
-        alone,
-        own,
-        [known[level].noise + MODEL_NOISE for level in range(lowest)],
-        amplitude,
-        smooth,
-    )
-
-
-def _coarse_zone(zone: Tensor | None, step: int) -> Tensor | None:
-    return None if zone is None else zone[:, step // 2 :: step, step // 2 :: step].contiguous()
-
-
-def _by_zone(estimate, zones: list[Estimators], zone: Tensor | None, shape: Tensor, noise: Tensor):
-    """Apply each zone's estimator to its own cells; returns pictures."""
-    grid = noise.shape
-    shape, noise = shape.reshape(-1, shape.shape[-1]), noise.reshape(-1)
-    if zone is None or len(zones) == 1:
-        found = estimate(zones[0], shape, noise)
-    else:
-        places = [torch.nonzero(zone.reshape(-1) == number)[:, 0] for number in range(len(zones))]
-        parts = [
-            estimate(one, shape[place], noise[place])
-            for one, place in zip(zones, places, strict=True)
-            if len(place)
-        ]
-        order = torch.argsort(torch.cat(places))
-        found = [torch.cat(part)[order] for part in zip(*parts, strict=True)]
-    return [part.view(*grid, *part.shape[1:]) for part in found]
-
-
-def noise_factor(y: Tensor, ratio: Tensor, camera: Camera) -> Tensor:
-    """Return by how much a picture is noisier than its stated ratio says, in power, (B, 1, 1).
-
-    Neighbouring pixels, each divided by its amplitude, differ by noise alone nearly everywhere, all
-    the more in directions of the measurement that spectra hardly reach. The median of these
-    differences over the picture is not moved by the edges in it.
-    """
-    y, ratio = y[:, ::2], ratio[:, ::2]  # every other row is plenty
-    amplitude = (y @ camera.project[:, -1:]).clamp_min(1e-30)
-    quiet = (y @ camera.quiet) / amplitude
-    power = ratio * (y / amplitude).square().mean(-1)
-    expected = power[:, :, 1:] + power[:, :, :-1]
-    steps = (quiet[:, :, 1:] - quiet[:, :, :-1]).square().mean(-1) / expected
-    steps = torch.where(expected < 1e6, steps, torch.nan).flatten(1)
-    count = camera.quiet.shape[1]
-    # Wilson and Hilferty: the median of a mean of `count` squares.
-    factor = steps.nanmedian(1).values / (1 - 2 / (9 * count)) ** 3
-    return factor.nan_to_num(1.0).clamp(0.05, 20.0)[:, None, None]
 
 
 # --- the back end -------------------------------------------------------------------------------

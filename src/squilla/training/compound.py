@@ -17,12 +17,10 @@ from torch.nn import functional
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.files.disk import replacing
-from squilla.reconstruction.compound import (
+from squilla.reconstruction.compound import ZONES, BackEnd, Compound
+from squilla.reconstruction.evidence import (
     LEVELS,
-    ZONES,
-    BackEnd,
     Camera,
-    Compound,
     Evidence,
     gather_evidence,
     noise_factor,
