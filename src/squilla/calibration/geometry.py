@@ -165,9 +165,14 @@ def lattice_from_flat(flat: np.ndarray, design: CameraDesign) -> Lattice:
     found = find_windows(flat, shape, design.pitch * wider)
     middle = found.mean(0)
     centre = middle + (found - middle) / wider
+    return lattice_at(design, centre)
+
+
+def lattice_at(design: CameraDesign, centre: np.ndarray) -> Lattice:
+    """Return the lattice of a design with its units at these places, (M, 2) px."""
     reference = design.field.reference
     return Lattice(
-        shape=shape,
+        shape=(design.array.rows, design.array.columns),
         centre=centre,
         baseline=(centre - centre[reference]) / design.pitch,
         reference=reference,

@@ -9,7 +9,8 @@ from scipy.ndimage import gaussian_filter
 from torch import Generator
 from xarray import DataArray
 
-from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.calibration import Calibration, Pixels
+from squilla.calibration.geometry import lattice_at
 from squilla.calibration.known import KnownScene
 from squilla.calibration.sensitivity import SweepStep
 from squilla.camera.scenes import chart_layout
@@ -176,18 +177,6 @@ def ideal_calibration(camera: Camera, angles: int = 5) -> Calibration:
     angle = np.sqrt(np.linspace(0, corner**2, angles))
     array = design.filters.layout == "array"
     centre = np.repeat(design.centres, 1 if array else design.channels, 0)
-    reference = design.field.reference
-    lattice = Lattice(
-        shape=(design.array.rows, design.array.columns),
-        centre=centre,
-        baseline=(centre - centre[reference]) / design.pitch,
-        reference=reference,
-        field=(design.field.size, design.field.size),
-        focal=design.focal,
-        pitch=design.pitch,
-        pixel=design.sensor.pixel,
-        usual=design.lens.focus_distance,
-    )
     sensor = design.sensor
     dark_rate = camera.sensor.dark_rate / sensor.gain
     usual_rate = np.float32(sensor.dark_current / 1000 / sensor.gain)
@@ -202,7 +191,12 @@ def ideal_calibration(camera: Camera, angles: int = 5) -> Calibration:
     )
     provenance = {"design": design.name, "camera": camera.serial, "made": "from the twin's truth"}
     return Calibration(
-        design.wavelength, camera.sensitivity(angle), angle, lattice, pixels, provenance=provenance
+        design.wavelength,
+        camera.sensitivity(angle),
+        angle,
+        lattice_at(design, centre),
+        pixels,
+        provenance=provenance,
     )
 
 

@@ -42,15 +42,16 @@ def stray_light(
         return {"stray_light": "not judged: the sub-images leave no part of the sensor dark"}
     level = np.empty(len(blocks), np.float32)
     _levels(frame, pixels.bias, pixels.dark_rate, np.float32(exposure or 0.0), blocks, level)
+    signal = max(signal, 1e-3)  # DN; of a frame that shows no picture at all
     share, peak = float(level.mean()) / signal, float(level.max()) / signal
     noise = np.sqrt((pixels.read_noise / pixels.gain) ** 2 + 1 / 12) / _BLOCK / signal
     found = {"stray_share": share, "stray_peak": peak}
     if max(share, peak - 8 * noise) < _SHARE:
         return found | {"stray_light": "none seen"}
     return found | {
-        "stray_light": f"Light falls beside the sub-images, {100 * share:.0f} % of the signal on "
-        f"the mean and {100 * peak:.0f} % at the brightest: something outside the field reaches "
-        "the sub-images of neighbouring lenses too; check the aperture stop, or shade it."
+        "stray_light": f"Light falls beside the sub-images, up to {100 * peak:.0f} % of their mean "
+        "signal: something outside the field reaches the sub-images of neighbouring lenses too; "
+        "check the aperture stop, or shade it."
     }
 
 
