@@ -1,6 +1,7 @@
 """From a raw frame to the measurement: correct it, find the disparity, align the sub-images."""
 
-from dataclasses import dataclass, field
+import warnings
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numba
@@ -9,12 +10,23 @@ import torch
 from torch import Tensor
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
-from squilla.calibration.disparity import edges, find_disparity
+from squilla.calibration.disparity import find_plane, fit_plane, plane_map
+from squilla.calibration.edges import find_edges
+from squilla.calibration.quality import COSTLY, STALE, colour_error, drift, misalignment
 from squilla.calibration.resample import SINC, resample
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 
 _TAPS = SINC.shape[0]
+
+_DRIFT = 0.5
+"""What a live scene's disparity may change by from frame to frame, px per pitch."""
+
+_LOOSE = 0.5
+"""How far units may have moved since the calibration, px (standard deviation)."""
+
+_CLEAR = 0.5
+"""Mean correlation of the sub-images' edges above which shifts of single units are believed."""
 
 _TEXTURED = 0.1
 """Mean correlation of the sub-images' edges below which they agree by chance."""
@@ -42,7 +54,13 @@ class Measurement:
 
 
 def measure(
-    raw: Raw, calibration: Calibration, *, distance: float | None = None, nearest: float = 60.0
+    raw: Raw,
+    calibration: Calibration,
+    *,
+    distance: float | None = None,
+    nearest: float = 60.0,
+    start: Measurement | None = None,
+    refine: bool | None = None,
 ) -> Measurement:
     """Turn a raw frame into the aligned measurement.
 
@@ -55,6 +73,11 @@ def measure(
         Distance of the scene's plane, mm; by default it is found from the scene itself.
     nearest : float
         The shortest distance that is looked for, mm.
+    start : Measurement, optional
+        Of the frame before, from which a live scene differs little; spares the search.
+    refine : bool, optional
+        Whether every unit's own place is found from the scene too; by default where the lattice
+        looks as if it had moved since its calibration.
 
     Returns
     -------
@@ -73,42 +96,45 @@ def measure(
             raise InputError(
                 f"The distance must be a number of mm above {shortest:g}, not {given:g}."
             )
-    farthest = float(np.abs(lattice.baseline).max())
-    closest = nearest if distance is None else distance
-    margin = int(np.ceil(lattice.disparity(closest) * farthest)) + _TAPS
+    largest = lattice.disparity(nearest if distance is None else distance)
+    before = None
+    if start is not None and start.disparity.shape == lattice.field:
+        before = fit_plane(start.disparity.numpy())
+        largest = min(largest, float(np.abs(before).sum()) + _DRIFT)
+    margin = int(np.ceil(largest * np.abs(lattice.baseline).max())) + _TAPS
     views = sub_images(raw, lattice, pixels, margin)
     snr = _judge(views, raw, pixels)
-    score = 1.0
+    noise = _noise_variance(views, pixels)
     if distance is not None:
-        disparity, how = lattice.disparity(distance), "from the given distance"
+        plane, quality = np.array([lattice.disparity(distance), 0, 0]), {"alignment": "as given"}
     else:
-        noise = _noise_variance(views, pixels)
-        features = edges(views.image.numpy(), noise, views.bad.numpy())
-        disparity, score = find_disparity(
-            features, views.offset, lattice.baseline, lattice.disparity(nearest)
+        plane, offset, quality = place(
+            views, lattice, largest, noise=noise, start=before, refine=refine
         )
-        how = "from the scene"
-        if score < _TEXTURED:
-            disparity, how = lattice.disparity(lattice.usual), "no texture: at the usual distance"
+        if before is not None and np.abs(plane - before).sum() > _DRIFT:
+            return measure(raw, calibration, nearest=nearest, refine=refine)  # another scene
+        views = replace(views, offset=views.offset + offset)
+    disparity = plane_map(plane, lattice).astype(np.float32)
     y, valid = align(views, lattice, disparity)
+    if "misalignment" in quality:
+        quality["colour_error"] = colour_error(y, noise, quality["misalignment"])
+        _warn(quality)
     snr_of_point = _pointwise_snr(y, pixels)
     y = y / (raw.exposure or 1.0)
-    shape = lattice.field
     return Measurement(
         y,
         valid,
         torch.from_numpy(lattice.field_angle()).float(),
-        torch.full(shape, float(disparity)),
+        torch.from_numpy(disparity),
         snr_of_point,
         {
             "snr": snr,
             "camera": raw.metadata.get("camera", "unknown"),
             "exposure": raw.exposure or 0.0,
             "unit": "DN/ms" if raw.exposure else "DN, exposure unknown",
-            "disparity": disparity,
-            "distance": lattice.distance(disparity),
-            "alignment": how,
-            "alignment_score": score,
+            "disparity": float(plane[0]),
+            "distance": lattice.distance(float(plane[0])),
+            **quality,
         },
     )
 
@@ -267,6 +293,77 @@ def _fitting(raw: Raw, calibration: Calibration) -> tuple[Lattice, Pixels]:
             f"The raw frame is of camera {taken!r}, the calibration of {made!r}; use its own."
         )
     return lattice, pixels
+
+
+# --- placing ----------------------------------------------------------------------------------
+
+
+def place(
+    views: SubImages,
+    lattice: Lattice,
+    largest: float,
+    *,
+    noise: np.ndarray | None = None,
+    start: np.ndarray | None = None,
+    refine: bool | None = None,
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """Find where the units see the scene, and say how well.
+
+    Parameters
+    ----------
+    views : SubImages
+    lattice : Lattice
+    largest : float
+        Largest disparity looked for, px per pitch.
+    noise : array, (M,), optional
+        Variance of each sub-image's noise.
+    start : array, (3,), optional
+        The plane of a frame that differs little.
+    refine : bool, optional
+        Whether every unit's own place is found from the scene too; by default where the lattice
+        looks as if it had moved since its calibration.
+
+    Returns
+    -------
+    plane : array, (3,)
+        Disparity in the middle and what it grows by to the last row and column, px per pitch.
+    offset : array, (M, 2)
+        By which each unit lies beside its place in the lattice, px.
+    quality : dict
+        How it was found and how sure it is, for the provenance.
+    """
+    edges = find_edges(views.image.numpy(), views.bad.numpy(), noise)
+    first = views.margin + views.offset
+    found = find_plane(edges, lattice, first, largest, start=start)
+    moved = drift(found, lattice)
+    if refine or (refine is None and moved > STALE and found.score > _CLEAR):
+        found = find_plane(edges, lattice, first, largest, start=found.plane, free=_LOOSE)
+        moved = drift(found, lattice)
+    quality = {"alignment": "from the scene", "alignment_score": found.score}
+    quality["misalignment"] = misalignment(found, lattice)
+    quality["lattice_moved"] = moved
+    # What agrees beyond infinity is no scene: a pattern that every unit shows at the same place.
+    if found.score >= _TEXTURED and found.plane[0] > -_TEXTURED:
+        return found.plane, found.offset, quality
+    usual = np.array([lattice.disparity(lattice.usual), 0, 0])
+    return usual, 0 * found.offset, quality | {"alignment": "no texture: at the usual distance"}
+
+
+def _warn(quality: dict[str, Any]) -> None:
+    """Tell a person what the figures mean where they are bad."""
+    if quality["alignment"].startswith("no texture"):
+        says = "The scene has too little texture to align by; it is taken to be at the usual "
+        says += "distance. Give `distance` if you know it."
+    elif quality["colour_error"] > COSTLY:
+        says = f"The sub-images may lie {quality['misalignment']:.2f} px off each other, which "
+        says += f"makes the colours wrong by about {100 * quality['colour_error']:.0f} %; is the "
+        says += "scene no plane, or the calibration of another day?"
+    elif quality["lattice_moved"] > STALE:
+        says = f"The units lie {quality['lattice_moved']:.2f} px beside their calibrated places: "
+        says += "the array has moved since; calibrate anew."
+    else:
+        return
+    warnings.warn(says, stacklevel=3)
 
 
 # --- resampling -------------------------------------------------------------------------------
