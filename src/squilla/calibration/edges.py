@@ -83,21 +83,17 @@ def find_edges(
 
 
 def _remove_shading(values: np.ndarray, good: np.ndarray) -> None:
-    """Take from each unit's gradients what is linear in position.
+    """Take from each unit's gradients what grows from the middle of its window outwards.
 
-    It is what a quadratic shading leaves, such as that of filters that see every field angle
-    another way: it stays with the unit when the scene moves, and would hold it where it is.
+    So filters shade their sub-images, for they pass less or more at larger field angles. It stays
+    with the unit when the scene moves, and would hold it where it is.
     """
-    parts, units, height, width = values.shape
-    y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)[None, :]
-    terms = np.stack([np.ones((height, width)), y + 0 * x, x + 0 * y]).reshape(3, -1)
-    terms = terms.astype(np.float32)
-    products = (terms[:, None] * terms[None]).reshape(9, -1)
-    gram = (good.reshape(units, -1).astype(np.float32) @ products.T).reshape(units, 3, 3)
-    flat = values.reshape(parts, units, -1)
-    fit = np.linalg.solve(gram + 1e-3 * np.eye(3), np.moveaxis(flat @ terms.T, 0, -1))
-    flat -= np.einsum("mkc,kp->cmp", fit.astype(np.float32), terms)
-    flat *= good.reshape(units, -1)
+    _, units, height, width = values.shape
+    y, x = np.arange(height) - (height - 1) / 2, np.arange(width) - (width - 1) / 2
+    outwards = np.stack(np.broadcast_arrays(x, y[:, None])).astype(np.float32)
+    power = good.reshape(units, -1).astype(np.float32) @ np.square(outwards).sum(0).ravel()
+    share = np.einsum("cmhw,chw->m", values, outwards) / (power + 1e-9)
+    values -= share[:, None, None] * outwards[:, None] * good
 
 
 def _enough(images: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> float:

@@ -22,10 +22,8 @@ def misalignment(found: Placement, lattice: Lattice) -> float:
     length = float(np.mean(lattice.baseline**2))
     plane = length * float(np.diag(found.covariance) @ [1, 1 / 3, 1 / 3])  # y^2, x^2 over -1..1
     noise = float(np.mean(found.uncertainty**2))
-    if found.offset.any():  # single units were free, and followed their noise
-        units = noise
-    else:
-        units = float(np.mean(found.leftover**2)) - noise
+    followed = found.offset.any()  # were single units free, they followed their noise
+    units = noise if followed else float(np.mean(found.leftover**2)) - noise
     relief = length * float(np.median(found.relief**2 - found.flatness**2))
     return float(np.sqrt(plane + max(units, 0) + max(relief, 0)))
 
