@@ -106,7 +106,8 @@ def measure(
     snr = _judge(views, raw, pixels)
     noise = _noise_variance(views, pixels)
     if distance is not None:
-        plane, quality = np.array([lattice.disparity(distance), 0, 0]), {"alignment": "as given"}
+        plane = np.array([lattice.disparity(distance), 0, 0])
+        quality = {"alignment": "from the given distance", "alignment_score": 1.0}
     else:
         plane, offset, quality = place(
             views, lattice, largest, noise=noise, start=before, refine=refine
@@ -334,10 +335,11 @@ def place(
     """
     edges = find_edges(views.image.numpy(), views.bad.numpy(), noise)
     first = views.margin + views.offset
-    found = find_plane(edges, lattice, first, largest, start=start)
+    span = (0.0, largest)
+    found = find_plane(edges, lattice, first, span, start=start)
     moved = drift(found, lattice)
     if refine or (refine is None and moved > STALE and found.score > _CLEAR):
-        found = find_plane(edges, lattice, first, largest, start=found.plane, free=_LOOSE)
+        found = find_plane(edges, lattice, first, span, start=found.plane, free=_LOOSE)
         moved = drift(found, lattice)
     quality = {"alignment": "from the scene", "alignment_score": found.score}
     quality["misalignment"] = misalignment(found, lattice)

@@ -70,7 +70,7 @@ def lattice_from_shots(
         origin, images = windows(shot.astype(np.float32), lattice, margin)
         edges = find_edges(images)
         first = lattice.centre - origin - half
-        found = find_plane(edges, lattice, first, lattice.disparity(nearest), free=_LOOSE)
+        found = find_plane(edges, lattice, first, (0.0, lattice.disparity(nearest)), free=_LOOSE)
         if found.score < 0.3:
             raise InputError(
                 f"The sub-images of shot {number} agree by {found.score:.2f} only; use a richly "

@@ -82,7 +82,7 @@ def find_plane(
     edges: Edges,
     lattice: Lattice,
     first: np.ndarray,
-    largest: float,
+    span: tuple[float, float],
     *,
     start: np.ndarray | None = None,
     free: float = 0.0,
@@ -95,8 +95,8 @@ def find_plane(
     lattice : Lattice
     first : array, (M, 2)
         Where in its window each unit sees the reference's first pixel at infinity, px.
-    largest : float
-        Largest disparity looked for, px per pitch.
+    span : (float, float)
+        Least and largest disparity looked for, px per pitch.
     start : array, (3,), optional
         A plane within about 2 px at the outermost units; spares the search.
     free : float
@@ -108,7 +108,7 @@ def find_plane(
     """
     if start is None:
         coarse = edges.directions()
-        plane = np.array([_search(coarse, lattice, first, largest), 0.0, 0.0])
+        plane = np.array([_search(coarse, lattice, first, span), 0.0, 0.0])
         stages = [(coarse, 1), (edges, 1), (edges, _RANK)]
     else:
         plane, stages = np.array(start, float), [(edges, 1), (edges, _RANK)]
@@ -314,24 +314,34 @@ def _solve(evidence: Evidence, lattice: Lattice, plane, offset, free: float):
     doubt = np.array([1e5, *np.full(terms - 1, steep), *np.full(2 * units if free else 0, free)])
     known = np.array([0, *plane[1:], *(offset.ravel() if free else ())])
     precision = along.T @ evidence.precision.reshape(len(along), -1) @ along
+    if free:  # a shift of all units together is none, and one along all baselines is disparity
+        none = np.stack(
+            [lattice.baseline, np.ones((units, 2)) * [1, 0], np.ones((units, 2)) * [0, 1]]
+        )
+        none = none.reshape(3, -1) / np.linalg.norm(none.reshape(3, -1), axis=1)[:, None]
+        precision[terms:, terms:] += 100 * precision.max() * none.T @ none
     precision += np.diag(doubt**-2.0)
     step = np.linalg.solve(precision, along.T @ evidence.pull.ravel() - known / doubt**2)
     moved = step[terms:].reshape(units, 2) if free else np.zeros_like(offset)
     return step[:terms], moved, np.linalg.inv(precision[:terms, :terms])
 
 
-def _search(edges: Edges, lattice: Lattice, first: np.ndarray, largest: float) -> float:
+def _search(edges: Edges, lattice: Lattice, first: np.ndarray, span: tuple[float, float]) -> float:
     """Return the disparity at which all pairs of units together agree best, px per pitch."""
     import torch
 
+    reach = _reach(lattice)
+    room = int(np.ceil(max(map(abs, span)) * reach / edges.step))  # or what leaves comes back
     taper = _taper(edges.values.shape[2])[:, None] * _taper(edges.values.shape[3])
     values = (edges.values - edges.values.mean((2, 3), keepdims=True)) * taper
-    whole = torch.fft.fft2(torch.complex(*torch.from_numpy(values)))
+    size = [length + room for length in taper.shape]
+    whole = torch.fft.fft2(torch.complex(*torch.from_numpy(values)), s=size)
     rows, columns = _low(whole.shape[1]), _low(whole.shape[2])
     spectra = whole[:, rows[:, None], columns]
     angle_y = 2j * np.pi / edges.step * torch.fft.fftfreq(whole.shape[1])[rows]
     angle_x = 2j * np.pi / edges.step * torch.fft.fftfreq(whole.shape[2])[columns]
-    candidates = np.arange(-1, largest * _reach(lattice) + 2) / _reach(lattice)  # 1 px apart
+    # The outermost unit moves by 1 px from one to the next.
+    candidates = np.arange(span[0] * reach - 1, span[1] * reach + 2) / reach
     total = []
     for candidate in candidates:
         shift = torch.from_numpy(first + candidate * lattice.baseline).float()

@@ -99,11 +99,14 @@ def _index(middles: np.ndarray, pitch: float) -> np.ndarray:
     down = step[
         (np.abs(step[..., 0] - pitch) < 0.15 * pitch) & (np.abs(step[..., 1]) < 0.15 * pitch)
     ]
-    if not len(across) or not len(down):
+    if not len(across) and not len(down):
         raise InputError(
             f"The lit areas of the flat frame do not lie {pitch:.0f} px apart, as the design says."
         )
-    basis = np.stack([np.median(down, 0), np.median(across, 0)])
+    # In a single row or column the other direction is at right angles to it.
+    right = np.median(across, 0) if len(across) else np.median(down, 0)[::-1] * [-1, 1]
+    below = np.median(down, 0) if len(down) else right[::-1] * [1, -1]
+    basis = np.stack([below, right])
     return np.rint((middles - middles[0]) @ np.linalg.inv(basis)).astype(int)
 
 
@@ -213,7 +216,7 @@ def refine_with_target(
     at_target = replace(lattice, centre=lattice.centre + disparity * lattice.baseline)
     origin, images = windows(corrected, at_target, margin)
     start = at_target.centre - origin - (np.array(lattice.field) - 1) / 2 - margin
-    found = find_plane(find_edges(images), at_target, start, 0.0, free=_LOOSE)
+    found = find_plane(find_edges(images), at_target, start, (0.0, 0.0), free=_LOOSE)
     if found.score < 0.3:
         raise InputError(
             f"The target's sub-images agree by {found.score:.2f} only; use a richly textured, "

@@ -99,6 +99,9 @@ def calibrate(
     sweep: Annotated[Path, typer.Option(help="Folder with narrow-band flats and sweep.csv.")],
     target: Annotated[Path | None, typer.Option(help="Frame of a textured plane.")] = None,
     target_distance: Annotated[float | None, typer.Option(help="Its distance, mm.")] = None,
+    shots: Annotated[
+        Path | None, typer.Option(help="Folder with hand-held shots of a textured plane.")
+    ] = None,
     camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
     as_json: Json = False,
 ) -> None:
@@ -124,6 +127,7 @@ def calibrate(
         sweep=track(steps, "sweep", disable=as_json),
         target=None if target is None else read_raw(target),
         target_distance=target_distance,
+        shots=() if shots is None else read_raws(shots),
     )
     calibration.save(output)
     if as_json:
