@@ -25,6 +25,7 @@ _HOME = {
     "load_calibration": "calibration.store",
     "Measurement": "calibration.alignment",
     "measure": "calibration.alignment",
+    "align_stack": "calibration.stack",
     "Reconstructor": "reconstruction.reconstructor",
     "load_model": "reconstruction.reconstructor",
     "train": "training.fit",
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from squilla.calibration.alignment import Measurement, measure
     from squilla.calibration.calibrate import calibrate
     from squilla.calibration.calibration import Calibration
+    from squilla.calibration.stack import align_stack
     from squilla.calibration.store import load_calibration
     from squilla.camera.design import CameraDesign
     from squilla.camera.scenes import load_scene

@@ -1,6 +1,7 @@
 """From a raw frame to the measurement: correct it, find the disparity, align the sub-images."""
 
-from dataclasses import dataclass, field
+import warnings
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numba
@@ -10,13 +11,24 @@ from torch import Tensor
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.depth import Depth, find_depth
-from squilla.calibration.disparity import edges, find_disparity
+from squilla.calibration.disparity import find_plane, fit_plane, plane_map
+from squilla.calibration.edges import find_edges
+from squilla.calibration.quality import COSTLY, STALE, colour_error, drift, misalignment
 from squilla.calibration.resample import SINC, resample
 from squilla.calibration.stray import stray_light
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 
 _TAPS = SINC.shape[0]
+
+_DRIFT = 0.5
+"""What a live scene's disparity may change by from frame to frame, px per pitch."""
+
+_LOOSE = 0.5
+"""How far units may have moved since the calibration, px (standard deviation)."""
+
+_CLEAR = 0.5
+"""Mean correlation of the sub-images' edges above which shifts of single units are believed."""
 
 _TEXTURED = 0.1
 """Mean correlation of the sub-images' edges below which they agree by chance."""
@@ -53,6 +65,8 @@ def measure(
     distance: float | None = None,
     nearest: float = 60.0,
     depth: bool = False,
+    start: Measurement | None = None,
+    refine: bool | None = None,
 ) -> Measurement:
     """Turn a raw frame into the aligned measurement.
 
@@ -67,6 +81,11 @@ def measure(
         The shortest distance that is looked for, mm.
     depth : bool
         Find a distance for every point instead of one for the whole scene.
+    start : Measurement, optional
+        Of the frame before, from which a live scene differs little; spares the search.
+    refine : bool, optional
+        Whether every unit's own place is found from the scene too; by default where the lattice
+        looks as if it had moved since its calibration.
 
     Returns
     -------
@@ -88,38 +107,45 @@ def measure(
             )
     if depth and distance is not None:
         raise InputError("Give either the distance of the scene or depth, which finds it.")
-    farthest = float(np.abs(lattice.baseline).max())
-    closest = nearest if distance is None else distance
-    margin = int(np.ceil(lattice.disparity(closest) * farthest)) + _TAPS
+    largest = lattice.disparity(nearest if distance is None else distance)
+    before = None
+    if start is not None and not depth and start.disparity.shape == lattice.field:
+        before = fit_plane(start.disparity.numpy())
+        largest = min(largest, float(np.abs(before).sum()) + _DRIFT)
+    margin = int(np.ceil(largest * np.abs(lattice.baseline).max())) + _TAPS
     views = sub_images(raw, lattice, pixels, margin)
     snr = _judge(views, raw, pixels)
-    score, relief, seen = 1.0, None, True
+    noise = _noise_variance(views, pixels)
+    relief, seen = None, True
     if depth:
-        noise = _noise_variance(views, pixels)
-        disparity, deviation, seen = find_depth(views, lattice, noise, lattice.disparity(nearest))
+        disparity, deviation, seen = find_depth(views, lattice, noise, largest)
         relief = Depth.of(disparity, deviation, lattice)
-        score, how = float(relief.confident.float().mean()), "a distance for every point"
+        score = float(relief.confident.float().mean())
+        quality = {"alignment": "a distance for every point", "alignment_score": score}
     elif distance is not None:
-        disparity, how = lattice.disparity(distance), "from the given distance"
+        disparity = np.full(lattice.field, lattice.disparity(distance), np.float32)
+        quality = {"alignment": "from the given distance", "alignment_score": 1.0}
     else:
-        noise = _noise_variance(views, pixels)
-        features = edges(views.image.numpy(), noise, views.bad.numpy())
-        disparity, score = find_disparity(
-            features, views.offset, lattice.baseline, lattice.disparity(nearest)
+        plane, offset, quality = place(
+            views, lattice, largest, noise=noise, start=before, refine=refine
         )
-        how = "from the scene"
-        if score < _TEXTURED:
-            disparity, how = lattice.disparity(lattice.usual), "no texture: at the usual distance"
+        if before is not None and np.abs(plane - before).sum() > _DRIFT:
+            return measure(raw, calibration, nearest=nearest, refine=refine)  # another scene
+        views = replace(views, offset=views.offset + offset)
+        disparity = plane_map(plane, lattice).astype(np.float32)
     y, valid = align(views, lattice, disparity)
     snr_of_point = pointwise_snr(y, pixels)
     signal = float(y.mean())
+    if "misalignment" in quality:
+        quality["colour_error"] = colour_error(y, noise, quality["misalignment"])
+        _warn(quality)
     y = y / (raw.exposure or 1.0)
     typical = float(np.median(disparity))
     return Measurement(
         y,
         valid & torch.as_tensor(seen),
         torch.from_numpy(lattice.field_angle()).float(),
-        torch.from_numpy(np.broadcast_to(np.float32(disparity), lattice.field).copy()),
+        torch.from_numpy(disparity),
         snr_of_point,
         {
             "snr": snr,
@@ -128,8 +154,7 @@ def measure(
             "unit": "DN/ms" if raw.exposure else "DN, exposure unknown",
             "disparity": typical,
             "distance": lattice.distance(typical),
-            "alignment": how,
-            "alignment_score": score,
+            **quality,
             **stray_light(raw.frame, raw.exposure, pixels, signal),
         },
         relief,
@@ -290,6 +315,78 @@ def _fitting(raw: Raw, calibration: Calibration) -> tuple[Lattice, Pixels]:
             f"The raw frame is of camera {taken!r}, the calibration of {made!r}; use its own."
         )
     return lattice, pixels
+
+
+# --- placing ----------------------------------------------------------------------------------
+
+
+def place(
+    views: SubImages,
+    lattice: Lattice,
+    largest: float,
+    *,
+    noise: np.ndarray | None = None,
+    start: np.ndarray | None = None,
+    refine: bool | None = None,
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """Find where the units see the scene, and say how well.
+
+    Parameters
+    ----------
+    views : SubImages
+    lattice : Lattice
+    largest : float
+        Largest disparity looked for, px per pitch.
+    noise : array, (M,), optional
+        Variance of each sub-image's noise.
+    start : array, (3,), optional
+        The plane of a frame that differs little.
+    refine : bool, optional
+        Whether every unit's own place is found from the scene too; by default where the lattice
+        looks as if it had moved since its calibration.
+
+    Returns
+    -------
+    plane : array, (3,)
+        Disparity in the middle and what it grows by to the last row and column, px per pitch.
+    offset : array, (M, 2)
+        By which each unit lies beside its place in the lattice, px.
+    quality : dict
+        How it was found and how sure it is, for the provenance.
+    """
+    edges = find_edges(views.image.numpy(), views.bad.numpy(), noise)
+    first = views.margin + views.offset
+    span = (0.0, largest)
+    found = find_plane(edges, lattice, first, span, start=start)
+    moved = drift(found, lattice)
+    if refine or (refine is None and moved > STALE and found.score > _CLEAR):
+        found = find_plane(edges, lattice, first, span, start=found.plane, free=_LOOSE)
+        moved = drift(found, lattice)
+    quality = {"alignment": "from the scene", "alignment_score": found.score}
+    quality["misalignment"] = misalignment(found, lattice)
+    quality["lattice_moved"] = moved
+    # What agrees beyond infinity is no scene: a pattern that every unit shows at the same place.
+    if found.score >= _TEXTURED and found.plane[0] > -_TEXTURED:
+        return found.plane, found.offset, quality
+    usual = np.array([lattice.disparity(lattice.usual), 0, 0])
+    return usual, 0 * found.offset, quality | {"alignment": "no texture: at the usual distance"}
+
+
+def _warn(quality: dict[str, Any]) -> None:
+    """Tell a person what the figures mean where they are bad."""
+    if quality["alignment"].startswith("no texture"):
+        says = "The scene has too little texture to align by; it is taken to be at the usual "
+        says += "distance. Give `distance` if you know it."
+    elif quality["colour_error"] > COSTLY:
+        says = f"The sub-images may lie {quality['misalignment']:.2f} px off each other, which "
+        says += f"makes the colours wrong by about {100 * quality['colour_error']:.0f} %; is the "
+        says += "scene no plane, or the calibration of another day?"
+    elif quality["lattice_moved"] > STALE:
+        says = f"The units lie {quality['lattice_moved']:.2f} px beside their calibrated places: "
+        says += "the array has moved since; calibrate anew."
+    else:
+        return
+    warnings.warn(says, stacklevel=3)
 
 
 # --- resampling -------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import numpy as np
 
 from squilla import __version__
 from squilla.calibration.alignment import windows
+from squilla.calibration.bundle import lattice_from_shots
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.geometry import lattice_from_flat, refine_with_target
 from squilla.calibration.known import KnownScene, known_responses, sensitivity_from_spectra
@@ -35,6 +36,7 @@ def calibrate(
     known: Iterable[KnownScene] | None = None,
     target: Raw | None = None,
     target_distance: float | None = None,
+    shots: Iterable[Raw] = (),
 ) -> Calibration:
     """Learn a camera from its frames.
 
@@ -52,6 +54,9 @@ def calibrate(
         One frame of a textured plane facing the camera; refines the lattice lens by lens.
     target_distance : float, optional
         Its distance, mm.
+    shots : iterable of Raw
+        Hand-held shots of a textured plane at different distances that nobody measured, instead of
+        the target or beside it; they also tell how single views are bent.
 
     Returns
     -------
@@ -85,15 +90,16 @@ def calibrate(
     lattice = lattice_from_flat(light, design)
     if np.mean(windows(flats.mean, lattice, 0)[1] >= saturation) > 1e-3:
         raise InputError("The flat frames are saturated; shorten their exposure.")
+    if target is not None and (target_distance is None or not target_distance > 0):
+        raise InputError("Give the distance of the target in mm.")
+    seen = [_evenly_lit(raw, light, darks) for raw in ([target] if target else []) + list(shots)]
     aligned = {}
-    if target is not None:
-        if target_distance is None or not target_distance > 0:
-            raise InputError("Give the distance of the target in mm.")
-        if target.frame.shape != light.shape:
-            raise InputError(f"The target has {target.frame.shape} px, the flats {light.shape}.")
-        share = np.where(light > 0, light / max(float(np.percentile(light, 99)), 1e-9), 1.0)
-        corrected = (target.frame - darks.at(target.exposure)) / np.maximum(share, 0.02)
-        lattice, score = refine_with_target(corrected, lattice, target_distance)
+    if len(seen) > 1:
+        distances = {0: target_distance} if target_distance else {}
+        lattice, planes = lattice_from_shots(seen, lattice, distances=distances)
+        aligned = {"shot_distances": [round(lattice.distance(plane[0]), 1) for plane in planes]}
+    elif target_distance and seen:
+        lattice, score = refine_with_target(seen[0], lattice, target_distance)
         aligned = {"target_distance": target_distance, "target_score": score}
     lit = _lit(light, lattice)
     gain, read_noise = noise_of(darks.shortest, flats, lit)
@@ -176,6 +182,14 @@ def _effective_index(design: CameraDesign, sensitivity: np.ndarray, angle: np.nd
     level = sensitivity / sensitivity.mean((1, 2), keepdims=True)  # without vignetting
     axis, *cones = (cone(design, one) for one in angle)
     return fit_effective_index(level[0], level[1:], design.wavelength, cones, measured_in=axis)
+
+
+def _evenly_lit(raw: Raw, light: np.ndarray, darks: Darks) -> np.ndarray:
+    """Return a frame of the target as if every pixel had the same light, (rows, columns)."""
+    if raw.frame.shape != light.shape:
+        raise InputError(f"The target has {raw.frame.shape} px, the flats {light.shape}.")
+    share = np.where(light > 0, light / max(float(np.percentile(light, 99)), 1e-9), 1.0)
+    return (raw.frame - darks.at(raw.exposure)) / np.maximum(share, 0.02)
 
 
 def _lit(light: np.ndarray, lattice: Lattice) -> np.ndarray:

@@ -1,72 +1,361 @@
-"""How far sub-images are shifted against each other, whatever their filters do to the contrast.
+"""How far sub-images are shifted against each other: one plane for all units at once.
 
-The array is rigid, so one number, the disparity of the scene's plane, moves all sub-images. Filters
-change intensities from one sub-image to the next and may even invert them; the directions of edges
-they leave alone. So sub-images are compared by their double-angle gradient, which is the same for a
-step up and a step down.
+The array is rigid, so three numbers move all sub-images of a plane scene: the disparity in the
+middle of the field and its slopes, for the disparity of a plane is an affine function of image
+position. They are found from the edges of all units together: first by the highest sum of all
+pairs' correlations, then by Gauss-Newton steps that leave least of the edges unexplained by a few
+pictures, of which each unit sees its own mixture (the pictures and mixtures are profiled out).
 """
 
-import numba
+from dataclasses import dataclass
+
 import numpy as np
-import torch
-from scipy import ndimage
-from torch import Tensor
 
-_SMOOTHING = (0.8, 1.6, 3.2, 6.4)
-"""Standard deviations of the smoothing before the gradient to choose from, px."""
+from squilla.calibration.calibration import Lattice
+from squilla.calibration.edges import Edges
+from squilla.calibration.resample import CUBIC, monomials, resample
+
+_STEEP = 0.1
+"""Slope that planes are expected to have, of their disparity: 40 degrees in the thesis' camera."""
 
 
-def edges(
-    images: np.ndarray, noise: np.ndarray | None = None, bad: np.ndarray | None = None
-) -> Tensor:
-    """Return the double-angle gradient of pictures, (gx + i gy)^2 / |g|.
+_RANK = 6
+"""Most pictures that the gradients of all units are taken to be mixed from.
+
+Through other filters other parts of a colourful scene show. Were they all taken as one picture,
+such differences would look like shifts.
+"""
+
+_FAINT = 1.3
+"""Variance in units of the noise's from which on a picture is taken to be one of the mixture."""
+
+_PARTS = 5
+"""Rows and columns of parts of the field in which it is seen whether the scene is a plane."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What edges say of how units must move still, about one guess of where they lie.
+
+    Each unit's displacement is taken as a polynomial of K terms along y and along x; the misfit of
+    all units together is quadratic in the coefficients.
+
+    pull : (M, 2 K) slope of the log likelihood, 1/px.
+    precision : (M, 2 K, M, 2 K) its curvature, 1/px^2; zero for a shift of all units together.
+    relief : (2, B, B) pull and precision, 1/(px per pitch), of the disparity of each of B x B
+        parts of the field alone.
+    score : mean correlation of each unit's edges with those of the others; 0 for noise.
+    """
+
+    pull: np.ndarray
+    precision: np.ndarray
+    relief: np.ndarray
+    score: float
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the units see the scene.
+
+    plane : (3,) px per pitch; disparity in the middle of the field, and what it grows by from
+        there to the last row's and the last column's middle.
+    covariance : (3, 3) of `plane`, by the noise of the edges, were the units' places known.
+    offset : (M, 2) px, by which each unit lies beside its place in the lattice.
+    leftover : (M, 2) px, by which single units would still move if each were free.
+    uncertainty : (M, 2) px, standard deviation of `leftover` by the noise.
+    relief : (B, B) px per pitch, by which parts of the field lie beside the plane.
+    flatness : (B, B) px per pitch, standard deviation of `relief` by the noise.
+    score : mean correlation of each unit's edges with those of the others; 0 for noise.
+    """
+
+    plane: np.ndarray
+    covariance: np.ndarray
+    offset: np.ndarray
+    leftover: np.ndarray
+    uncertainty: np.ndarray
+    relief: np.ndarray
+    flatness: np.ndarray
+    score: float
+
+
+def find_plane(
+    edges: Edges,
+    lattice: Lattice,
+    first: np.ndarray,
+    span: tuple[float, float],
+    *,
+    start: np.ndarray | None = None,
+    free: float = 0.0,
+) -> Placement:
+    """Find the plane of the scene, and where asked every unit's own offset.
 
     Parameters
     ----------
-    images : array, (M, H, W) float32
-    noise : array, (M,), optional
-        Variance of each picture's white noise. Pictures are smoothed just enough that in half of
-        them the gradients rise above its noise; without it, by 0.8 px.
-    bad : array, (M, H, W) bool, optional
-        Pixels not to be believed. Single ones are taken as filled; whole areas, such as the dark
-        around a sub-image, show no edges.
+    edges : Edges
+    lattice : Lattice
+    first : array, (M, 2)
+        Where in its window each unit sees the reference's first pixel at infinity, px.
+    span : (float, float)
+        Least and largest disparity looked for, px per pitch.
+    start : array, (3,), optional
+        A plane within about 2 px at the outermost units; spares the search.
+    free : float
+        How far units may lie beside their places, px (standard deviation).
 
     Returns
     -------
-    Tensor, (M, H, W) complex64
-        Tapered to zero at its border, of unit energy for each unit.
+    Placement
     """
-    for smooth in _SMOOTHING:
-        bell, slope = _derivative(smooth)
-        across, down = np.empty_like(images), np.empty_like(images)
-        _gradient(images, bell, slope, across, down)
-        if noise is None:
-            break
-        power = (across**2 + down**2).mean((1, 2))
-        of_noise = 2 * noise * (bell**2).sum() * (slope**2).sum()
-        if np.median(power / of_noise) > 2:
-            break
-    taper = _taper(images.shape[1])[:, None] * _taper(images.shape[2])[None, :]
-    weight = np.broadcast_to(taper, images.shape).copy()
-    for unit, wrong in enumerate(() if bad is None else bad):
-        area = ndimage.minimum_filter(wrong, 3)  # single pixels are no area
-        if area.any():
-            weight[unit][ndimage.maximum_filter(area, 3 + len(bell))] = 0
-    feature = np.empty(images.shape, np.complex64)
-    # The weakest edges are noise: their direction is shrunk to nothing.
-    power = across[:, ::4, ::4] ** 2 + down[:, ::4, ::4] ** 2
-    floor = np.sqrt(np.median(power, (1, 2)))
-    _double_angle(across, down, floor, weight, feature)
-    return torch.from_numpy(feature)
+    if start is None:
+        coarse = edges.directions()
+        plane = np.array([_search(coarse, lattice, first, span), 0.0, 0.0])
+        stages = [(coarse, 1), (edges, 1), (edges, _RANK)]
+    else:
+        plane, stages = np.array(start, float), [(edges, 1), (edges, _RANK)]
+    if free:  # several pictures would take for colour what is still misplaced
+        del stages[-1]
+    offset = np.zeros(first.shape)
+    for level, rank in stages:
+        for _ in range(8):
+            guess = plane_map(plane, lattice, level.step)
+            found = compare(level, lattice, first + offset, guess, 3, rank)
+            step, moved, covariance = _solve(found, lattice, plane, offset, free)
+            plane, offset = plane + step, offset + moved
+            change = max(np.abs(step).max() * _reach(lattice), np.abs(moved).max())
+            if change < 0.01 * level.step:
+                break
+    pull, precision = found.relief
+    leftover, uncertainty = _single(found)
+    return Placement(
+        plane, covariance, offset, leftover, uncertainty,
+        pull / precision, precision**-0.5, found.score,
+    )  # fmt: skip
 
 
-def _derivative(smooth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the taps of a Gaussian and of its slope, both of unit response."""
-    tap = np.arange(-int(np.ceil(3 * smooth)), int(np.ceil(3 * smooth)) + 1)
-    bell = np.exp(-(tap**2) / (2 * smooth**2))
-    bell /= bell.sum()
-    slope = tap * bell / (tap**2 * bell).sum()
-    return bell.astype(np.float32), slope.astype(np.float32)
+def _single(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much each unit alone would still move, and by the noise, (M, 2) px."""
+    units, terms = len(evidence.pull), evidence.pull.shape[1] // 2
+    own = np.array([0, terms])
+    precision = evidence.precision[np.arange(units), :, np.arange(units)][:, own[:, None], own]
+    covariance = np.linalg.inv(precision + 1e-6 * np.eye(2))
+    shift = np.einsum("mab,mb->ma", covariance, evidence.pull[:, own])
+    return shift, np.sqrt(np.einsum("maa->ma", covariance))
+
+
+def fit_plane(disparity: np.ndarray) -> np.ndarray:
+    """Return the plane that fits a disparity map best, (3,) as in `Placement`."""
+    few = (slice(None, None, 4), slice(None, None, 4))
+    terms = monomials(*disparity.shape)[:3, *few].reshape(3, -1)
+    return np.linalg.lstsq(terms.T, disparity[few].ravel(), rcond=None)[0]
+
+
+def plane_map(plane: np.ndarray, lattice: Lattice, step: int = 1) -> np.ndarray:
+    """Return the disparity of a plane at every `step`-th point of the field, (h, w)."""
+    return np.tensordot(plane, _grid(lattice.field, step)[1][:3], 1)
+
+
+def compare(
+    edges: Edges,
+    lattice: Lattice,
+    first: np.ndarray,
+    disparity: np.ndarray,
+    terms: int,
+    rank: int,
+) -> Evidence:
+    """Align edges by a guess, and see how each unit's should move to agree with all.
+
+    Parameters
+    ----------
+    edges : Edges
+    lattice : Lattice
+    first : array, (M, 2)
+        Where in its window each unit is taken to see the reference's first pixel at infinity, px.
+    disparity : array, (h, w)
+        At every `edges.step`-th point of the field.
+    terms : int
+        K, of the polynomial that each unit may move by: 1, 3 or 10.
+    rank : int
+        Most pictures that the units' edges are taken to be mixed from.
+
+    Returns
+    -------
+    Evidence
+    """
+    shape, grid, corner, scale = _grid(lattice.field, edges.step)
+    place = lattice.places(first)
+    place[..., 0] += corner
+    place = place * scale / edges.step
+    units, points = len(first), shape[0] * shape[1]
+    values = np.empty((2, units, *shape), np.float32)
+    seen = np.empty((units, *shape), bool)
+    baseline = lattice.baseline / edges.step
+    resample(edges.values, edges.bad, place, baseline, disparity, CUBIC, values, seen)
+    values *= seen
+    seen = seen.reshape(units, points).astype(np.float32)
+    values, seen = values.swapaxes(0, 1).reshape(units, -1), np.tile(seen, 2)
+    common, share, spread, score = _common(values, seen, rank)
+    rank = share.shape[1]
+    misfit = seen * (values / spread[:, None] - share @ common)
+    slopes = _slopes(common.reshape(2 * rank, *shape)).reshape(rank, 2, 2, points) / edges.step
+    slopes = slopes.swapaxes(1, 2)  # (rank, axis, part, points)
+    moves = slopes[:, :, None] * grid[:terms, None].reshape(terms, 1, points).astype(np.float32)
+    moves = moves.reshape(rank * 2 * terms, 2 * points)
+    pull = (misfit @ moves.T).reshape(units, rank, 2 * terms)
+    gram = (moves @ moves.T).reshape(rank, 2 * terms, rank, 2 * terms).astype(float)
+    free = np.eye(units) - share @ share.T
+    precision = np.einsum("ij,ir,js,rasb->iajb", free, share, share, gram, optimize=True)
+    return Evidence(
+        -np.einsum("mr,mra->ma", share, pull.astype(float)) / edges.shared,
+        precision / edges.shared,
+        _relief(misfit, share, free, slopes, lattice.baseline, shape) / edges.shared,
+        score,
+    )
+
+
+def _common(values: np.ndarray, seen: np.ndarray, rank: int) -> tuple:
+    """Return what units have in common: edges of all, and the share of each unit in them.
+
+    Parameters
+    ----------
+    values : array, (M, 2 P)
+    seen : array, (M, 2 P), 0 or 1
+    rank : int
+        Most pictures that the units' edges are taken to be mixed from.
+
+    Returns
+    -------
+    common : array, (rank, 2 P)
+    share : array, (M, rank), orthonormal: values / spread is about share @ common.
+    spread : array, (M,), standard deviation of each unit's noise.
+    score : float
+    """
+    points = values.shape[1] // 2
+    halves = [values[:, start : start + points // 2] for start in (0, points)]
+    upper = sum(half @ half.T for half in halves).astype(float)
+    whole = (values @ values.T).astype(float)
+    strength, vectors = np.linalg.eigh(whole)
+    alone = np.diag(whole) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
+    spread = np.sqrt(np.maximum(alone / (seen.sum(1) + 1e-9), 1e-5))
+    strength, vectors = np.linalg.eigh(whole / np.outer(spread, spread))
+    clear = int(np.sum(strength > _FAINT * values.shape[1]))
+    rank = max(1, min(rank, len(values) // 6, clear))
+    share = vectors[:, : -1 - rank : -1].astype(np.float32)
+    common = (share / spread[:, None].astype(np.float32)).T @ values
+    if not seen.all():  # what a unit does not see is taken from the others
+        scaled = values / spread[:, None].astype(np.float32)
+        common = share.T @ np.where(seen, scaled, share @ common)
+    score = (_agreement(upper, whole - upper) + _agreement(whole - upper, upper)) / 2
+    return common, share, spread.astype(np.float32), score
+
+
+def _agreement(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the mean correlation of each unit with the others in half of the field, 0 for noise.
+
+    How the units are weighted is learnt from the other half: what they have in common by chance
+    then does not count. `one` and `other` hold the units' inner products there, (M, M).
+    """
+    share = np.linalg.eigh(one)[1][:, -1]
+    energy, shared = np.diag(other), other @ share
+    rest = share @ shared - 2 * share * shared + share**2 * energy  # of the others' picture
+    alike = (shared - share * energy) / np.sqrt(np.maximum(rest * energy, 1e-12))
+    return float(np.mean(np.sign(share) * alike))  # some units may show the negative
+
+
+def _relief(misfit, share, free, slopes, baseline, shape) -> np.ndarray:
+    """Return pull and precision of the disparity in each part of the field, (2, B, B)."""
+    rank, points = share.shape[1], shape[0] * shape[1]
+    along = (baseline.T[None] * share.T[:, None]).reshape(2 * rank, -1)  # (rank axis, M)
+    slopes = slopes.reshape(2 * rank, -1)
+    pull = -((along @ misfit).astype(np.float32) * slopes).sum(0)
+    precision = ((along @ free @ along.T).astype(np.float32) @ slopes * slopes).sum(0)
+    rows, columns = (np.arange(size) * _PARTS // size for size in shape)
+    part = (rows[:, None] * _PARTS + columns).ravel()
+    sums = [
+        np.bincount(part, each.reshape(2, points).sum(0), _PARTS**2) for each in (pull, precision)
+    ]
+    return np.stack([sums[0], sums[1] + 1e-6]).reshape(2, _PARTS, _PARTS)
+
+
+def _grid(field: tuple[int, int], step: int) -> tuple:
+    """Return the shape, monomials, first pixel and scale of every `step`-th point of a field.
+
+    The scale, (2, 10), is by what each coefficient of a polynomial over the whole field changes
+    when the polynomial is stretched over these points.
+    """
+    shape = tuple(-(-size // step) for size in field)
+    span = [(count - 1) * step / (size - 1) for count, size in zip(shape, field, strict=True)]
+    corner = [(size - 1 - step * (count - 1)) / 2 for count, size in zip(shape, field, strict=True)]
+    scale = np.array([span[0] ** (a - b) * span[1] ** b for a in range(4) for b in range(a + 1)])
+    return shape, monomials(*shape) * scale[:, None, None], corner, scale
+
+
+def _slopes(picture: np.ndarray) -> np.ndarray:
+    """Return derivatives along y and x, (2, h, w) -> (2, 2, h, w), zero at the border."""
+    slopes = np.zeros((2, *picture.shape), np.float32)
+    inner = slice(2, -2)
+    for axis in (1, 2):
+        p = np.moveaxis(picture, axis, -1)
+        rise = (8 * (p[..., 3:-1] - p[..., 1:-3]) - (p[..., 4:] - p[..., :-4])) / 12
+        np.moveaxis(slopes[axis - 1], axis, -1)[..., inner] = rise
+    border = np.ones(picture.shape[1:], bool)
+    border[inner, inner] = False
+    slopes[..., border] = 0
+    return slopes.swapaxes(0, 1)
+
+
+def _solve(evidence: Evidence, lattice: Lattice, plane, offset, free: float):
+    """Return the most likely change of the plane and of the offsets, and the plane's covariance."""
+    terms, units = len(plane), len(offset)
+    along = np.einsum("mc,kl->mckl", lattice.baseline, np.eye(terms)).reshape(-1, terms)
+    if free:  # columns of the units' own shifts
+        own = np.einsum("mn,cd,k->mcknd", np.eye(units), np.eye(2), np.eye(terms)[0])
+        along = np.hstack([along, own.reshape(len(along), -1)])
+    steep = _STEEP * max(abs(plane[0]), 0.1)
+    doubt = np.array([1e5, *np.full(terms - 1, steep), *np.full(2 * units if free else 0, free)])
+    known = np.array([0, *plane[1:], *(offset.ravel() if free else ())])
+    precision = along.T @ evidence.precision.reshape(len(along), -1) @ along
+    if free:  # a shift of all units together is none, and one along all baselines is disparity
+        none = np.stack(
+            [lattice.baseline, np.ones((units, 2)) * [1, 0], np.ones((units, 2)) * [0, 1]]
+        )
+        none = none.reshape(3, -1) / np.linalg.norm(none.reshape(3, -1), axis=1)[:, None]
+        precision[terms:, terms:] += 100 * precision.max() * none.T @ none
+    precision += np.diag(doubt**-2.0)
+    step = np.linalg.solve(precision, along.T @ evidence.pull.ravel() - known / doubt**2)
+    moved = step[terms:].reshape(units, 2) if free else np.zeros_like(offset)
+    return step[:terms], moved, np.linalg.inv(precision[:terms, :terms])
+
+
+def _search(edges: Edges, lattice: Lattice, first: np.ndarray, span: tuple[float, float]) -> float:
+    """Return the disparity at which all pairs of units together agree best, px per pitch."""
+    import torch
+
+    reach = _reach(lattice)
+    room = int(np.ceil(max(map(abs, span)) * reach / edges.step))  # or what leaves comes back
+    taper = _taper(edges.values.shape[2])[:, None] * _taper(edges.values.shape[3])
+    values = (edges.values - edges.values.mean((2, 3), keepdims=True)) * taper
+    size = [length + room for length in taper.shape]
+    whole = torch.fft.fft2(torch.complex(*torch.from_numpy(values)), s=size)
+    rows, columns = _low(whole.shape[1]), _low(whole.shape[2])
+    spectra = whole[:, rows[:, None], columns]
+    angle_y = 2j * np.pi / edges.step * torch.fft.fftfreq(whole.shape[1])[rows]
+    angle_x = 2j * np.pi / edges.step * torch.fft.fftfreq(whole.shape[2])[columns]
+    # The outermost unit moves by 1 px from one to the next.
+    candidates = np.arange(span[0] * reach - 1, span[1] * reach + 2) / reach
+    total = []
+    for candidate in candidates:
+        shift = torch.from_numpy(first + candidate * lattice.baseline).float()
+        along, across = torch.exp(shift[:, :1] * angle_y), torch.exp(shift[:, 1:] * angle_x)
+        together = torch.einsum("mhw,mh,mw->hw", spectra, along, across)
+        total.append(float(together.abs().square().sum()))
+    return float(candidates[int(np.argmax(total))])
+
+
+def _low(size: int):
+    """Return the indices of the frequencies below a quarter of the sampling rate."""
+    import torch
+
+    return torch.cat([torch.arange(size // 4), torch.arange(size - size // 4, size)])
 
 
 def _taper(size: int, share: float = 0.1) -> np.ndarray:
@@ -76,221 +365,5 @@ def _taper(size: int, share: float = 0.1) -> np.ndarray:
     return np.concatenate([ramp, np.ones(size - 2 * edge), ramp[::-1]]).astype(np.float32)
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
-def _gradient(images, bell, slope, across, down):
-    """Fill in the smoothed gradient along columns and rows, (M, H, W) each."""
-    units, rows, columns = images.shape
-    reach = len(bell) // 2
-    for unit in numba.prange(units):
-        smooth = np.empty((rows, columns), np.float32)
-        steep = np.empty((rows, columns), np.float32)
-        for row in range(rows):
-            for column in range(columns):
-                a, b = np.float32(0), np.float32(0)
-                for k in range(-reach, reach + 1):
-                    value = images[unit, row, min(max(column + k, 0), columns - 1)]
-                    a += bell[k + reach] * value
-                    b += slope[k + reach] * value
-                smooth[row, column], steep[row, column] = a, b
-        for row in range(rows):
-            across[unit, row] = 0
-            down[unit, row] = 0
-            for k in range(-reach, reach + 1):
-                near = min(max(row + k, 0), rows - 1)
-                for column in range(columns):
-                    across[unit, row, column] += bell[k + reach] * steep[near, column]
-                    down[unit, row, column] += slope[k + reach] * smooth[near, column]
-
-
-@numba.njit(parallel=True, cache=True)
-def _double_angle(across, down, floor, weight, feature):
-    units, rows, columns = across.shape
-    for unit in numba.prange(units):
-        total, count = 0j, 1e-20
-        for row in range(rows):
-            for column in range(columns):
-                x, y = across[unit, row, column], down[unit, row, column]
-                size = np.sqrt(x * x + y * y) + floor[unit] + 1e-20
-                value = complex((x * x - y * y) / size, 2 * x * y / size)
-                feature[unit, row, column] = value
-                total += weight[unit, row, column] * value
-                count += weight[unit, row, column]
-        mean, energy = total / count, 0.0
-        for row in range(rows):
-            for column in range(columns):
-                value = (feature[unit, row, column] - mean) * weight[unit, row, column]
-                feature[unit, row, column] = value
-                energy += value.real**2 + value.imag**2
-        scale = 1 / np.sqrt(max(energy, 1e-30))
-        for row in range(rows):
-            for column in range(columns):
-                feature[unit, row, column] *= scale
-
-
-class _Spectra:
-    """Fourier transforms of features at the frequencies that matter, and how to shift them back.
-
-    values : (M, h, w) complex64, the frequencies below a quarter of the sampling rate.
-    y, x : (h, 1) and (1, w), radians per px.
-    """
-
-    def __init__(self, whole: Tensor):
-        height, width = whole.shape[-2:]
-        rows, columns = _low(height), _low(width)
-        self.values = whole[:, rows][:, :, columns].contiguous()
-        self.y = 2 * torch.pi * torch.fft.fftfreq(height)[rows][:, None]
-        self.x = 2 * torch.pi * torch.fft.fftfreq(width)[columns][None, :]
-
-    def at(self, position: Tensor) -> Tensor:
-        """Return the spectra of the features shifted back by `position` (M, 2), px."""
-        position = position.float()
-        along_y, along_x = position[:, :1, None] * self.y, position[:, 1:, None] * self.x
-        return self.values * torch.polar(torch.ones_like(along_y), along_y) * torch.polar(
-            torch.ones_like(along_x), along_x
-        )  # fmt: skip
-
-
-def _low(size: int) -> Tensor:
-    quarter = size // 4
-    return torch.cat([torch.arange(quarter), torch.arange(size - quarter, size)])
-
-
-def _linearise(spectra: _Spectra, position: Tensor) -> tuple[Tensor, Tensor, Tensor, float]:
-    """Compare the aligned features with their mean, the template.
-
-    With the template T a unit that is still shifted by a small d sees a (T - d . grad T).
-
-    Returns
-    -------
-    scale : Tensor, (M,), a of each unit
-    along : Tensor, (M, 2), its residual's component along each slope of the template
-    gram : Tensor, (2, 2), of the slopes
-    score : float, mean correlation of each unit with the mean of the others
-    """
-    moved = spectra.at(position)
-    template = moved.mean(0)
-    power = _dot(template, template)
-    shared = torch.einsum("mhw,hw->m", moved, template.conj()).real
-    scale = shared / power
-    slopes = torch.stack([1j * spectra.y * template, 1j * spectra.x * template])
-    gram = torch.einsum("ahw,bhw->ab", slopes, slopes.conj()).real
-    own = torch.einsum("hw,ahw->a", template, slopes.conj()).real
-    along = torch.einsum("mhw,ahw->ma", moved, slopes.conj()).real - scale[:, None] * own
-    energy = torch.view_as_real(moved).square().sum((1, 2, 3))
-    # Against the mean of the others: noise then scores zero.
-    units = len(moved)
-    others = (power - 2 * shared / units + energy / units**2).clamp_min(1e-20)
-    score = float(((shared - energy / units) / (others * energy).sqrt().clamp_min(1e-20)).mean())
-    return scale, along, gram, score
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return torch.einsum("hw,hw->", a, b.conj()).real
-
-
-def find_disparity(
-    features: Tensor, offset: np.ndarray, baseline: np.ndarray, largest: float
-) -> tuple[float, float]:
-    """Find the disparity of a plane from all sub-images at once.
-
-    Every unit's correlation with the reference is a surface over shifts; one disparity is a point
-    on each of them. The sum over the units has its highest peak at the truth, which a few joint
-    Gauss-Newton steps against the mean of the aligned features then place to a few hundredths of
-    a pixel.
-
-    Parameters
-    ----------
-    features : Tensor, (M, H, W) complex
-        Of `edges`.
-    offset : array, (M, 2)
-        Where each unit sees an infinitely distant point, against the reference pixel grid, px.
-    baseline : array, (M, 2)
-        Lens pitches.
-    largest : float
-        Largest disparity looked for, px per pitch.
-
-    Returns
-    -------
-    disparity : float
-        px per lens pitch.
-    score : float
-        Mean correlation of each unit's features with the mean of the others; 0 for noise.
-    """
-    whole = torch.fft.fft2(features)
-    reference = int(np.abs(baseline).sum(1).argmin())
-    surfaces = torch.fft.ifft2(whole * whole[reference].conj()).real
-    step = 0.25 / max(float(np.abs(baseline).max()), 1e-9)
-    candidates = np.arange(-4 * step, largest + step, step)
-    shifts = offset - offset[reference] + candidates[:, None, None] * baseline  # (D, M, 2)
-    total = _sample_periodic(surfaces, torch.from_numpy(shifts).float()).sum(1)
-    disparity, score = float(candidates[int(total.argmax())]), 0.0
-    spectra, direction = _Spectra(whole), torch.from_numpy(baseline).float()
-    for _ in range(6):
-        position = torch.from_numpy(offset + disparity * baseline)
-        scale, along, gram, score = _linearise(spectra, position)
-        numerator = (scale[:, None] * along * direction).sum()
-        curvature = torch.einsum("m,ma,ab,mb->", scale**2, direction, gram, direction)
-        change = -float(numerator / curvature.clamp_min(1e-20))
-        disparity += max(-step, min(step, change))
-        if abs(change) < 2e-4:
-            break
-    return disparity, score
-
-
-def _sample_periodic(surfaces: Tensor, shifts: Tensor) -> Tensor:
-    """Read surfaces (M, H, W) bilinearly at shifts (D, M, 2) px, both periodic; (D, M)."""
-    _, height, width = surfaces.shape
-    unit = torch.arange(len(surfaces))
-    low = shifts.floor().long()
-    part = shifts - low
-    total = torch.zeros(shifts.shape[:-1])
-    for i in (0, 1):
-        for j in (0, 1):
-            weight = (part[..., 0] if i else 1 - part[..., 0]) * (
-                part[..., 1] if j else 1 - part[..., 1]
-            )
-            total += weight * surfaces[unit, (low[..., 0] + i) % height, (low[..., 1] + j) % width]
-    return total
-
-
-def find_offsets(features: Tensor, start: np.ndarray, reference: int) -> tuple[np.ndarray, float]:
-    """Find every unit's own shift against the reference, jointly; for calibration targets.
-
-    Parameters
-    ----------
-    features : Tensor, (M, H, W) complex
-        Of `edges`.
-    start : array, (M, 2)
-        Shifts to start from, px, within a few px.
-    reference : int
-
-    Returns
-    -------
-    offset : array, (M, 2)
-        px; zero for the reference.
-    score : float
-        Mean correlation of each unit's features with the mean of the others; 0 for noise.
-    """
-    whole = torch.fft.fft2(features)
-    near = np.rint(start - start[reference])
-    position = torch.from_numpy(near) + _peak(whole, near, reference)
-    spectra, score = _Spectra(whole), 0.0
-    for _ in range(8):
-        scale, along, gram, score = _linearise(spectra, position)
-        step = -torch.linalg.solve(gram, along.T).T / scale[:, None]
-        position = position + step
-        position = position - position[reference].clone()
-        if float(step.abs().max()) < 1e-3:
-            break
-    return position.numpy(), score
-
-
-def _peak(whole: Tensor, position: np.ndarray, reference: int, reach: int = 12) -> Tensor:
-    """Return the shift of the highest correlation within `reach` px of whole positions, (M, 2)."""
-    surfaces = torch.fft.ifft2(whole * whole[reference].conj()).real
-    best = []
-    for surface, (y, x) in zip(surfaces, position.astype(int), strict=True):
-        near = torch.roll(surface, (reach - int(y), reach - int(x)), (0, 1))
-        place = int(near[: 2 * reach + 1, : 2 * reach + 1].argmax())
-        best.append((place // (2 * reach + 1) - reach, place % (2 * reach + 1) - reach))
-    return torch.tensor(best, dtype=torch.float64)
+def _reach(lattice: Lattice) -> float:
+    return max(float(np.abs(lattice.baseline).max()), 1e-9)

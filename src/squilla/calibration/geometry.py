@@ -7,9 +7,13 @@ from scipy import ndimage
 
 from squilla.calibration.alignment import windows
 from squilla.calibration.calibration import Lattice
-from squilla.calibration.disparity import edges, find_offsets
+from squilla.calibration.disparity import find_plane
+from squilla.calibration.edges import find_edges
 from squilla.camera.design import CameraDesign
 from squilla.errors import InputError
+
+_LOOSE = 3.0
+"""How far lenses may lie beside the places that a flat shows, px (standard deviation)."""
 
 
 def find_windows(flat: np.ndarray, shape: tuple[int, int], pitch: float) -> np.ndarray:
@@ -95,11 +99,14 @@ def _index(middles: np.ndarray, pitch: float) -> np.ndarray:
     down = step[
         (np.abs(step[..., 0] - pitch) < 0.15 * pitch) & (np.abs(step[..., 1]) < 0.15 * pitch)
     ]
-    if not len(across) or not len(down):
+    if not len(across) and not len(down):
         raise InputError(
             f"The lit areas of the flat frame do not lie {pitch:.0f} px apart, as the design says."
         )
-    basis = np.stack([np.median(down, 0), np.median(across, 0)])
+    # In a single row or column the other direction is at right angles to it.
+    right = np.median(across, 0) if len(across) else np.median(down, 0)[::-1] * [-1, 1]
+    below = np.median(down, 0) if len(down) else right[::-1] * [1, -1]
+    basis = np.stack([below, right])
     return np.rint((middles - middles[0]) @ np.linalg.inv(basis)).astype(int)
 
 
@@ -217,15 +224,16 @@ def refine_with_target(
     at_target = replace(lattice, centre=lattice.centre + disparity * lattice.baseline)
     origin, images = windows(corrected, at_target, margin)
     start = at_target.centre - origin - (np.array(lattice.field) - 1) / 2 - margin
-    reference = lattice.reference
-    shift, score = find_offsets(edges(images), start, reference)
-    if score < 0.3:
+    found = find_plane(find_edges(images), at_target, start, (0.0, 0.0), free=_LOOSE)
+    if found.score < 0.3:
         raise InputError(
-            f"The target's sub-images agree by {score:.2f} only; use a richly textured, evenly "
-            "lit flat target that faces the camera."
+            f"The target's sub-images agree by {found.score:.2f} only; use a richly textured, "
+            "evenly lit flat target that faces the camera."
         )
-    apart = (shift + origin) - (shift + origin)[reference]  # px on the sensor
+    reference = lattice.reference
+    apart = start + found.offset + found.plane[0] * lattice.baseline + origin  # px on the sensor
+    apart = apart - apart[reference]
     scale = 1 + disparity / lattice.pitch  # 1 + f / distance
     centre = lattice.centre.mean(0) + (apart - apart.mean(0)) / scale
     baseline = (centre - centre[reference]) / lattice.pitch
-    return replace(lattice, centre=centre, baseline=baseline), score
+    return replace(lattice, centre=centre, baseline=baseline), found.score

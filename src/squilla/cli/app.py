@@ -6,6 +6,7 @@ import typer
 
 from squilla import __version__
 from squilla.cli import camera, cameras, filters, steps
+from squilla.cli.align import align
 from squilla.cli.train import train
 from squilla.cli.view import live, view
 
@@ -23,6 +24,7 @@ app.command()(steps.simulate)
 app.command()(camera.rehearse)
 app.command()(steps.calibrate)
 app.command()(train)
+app.command()(align)
 app.command()(steps.reconstruct)
 app.command()(steps.evaluate)
 app.command()(view)

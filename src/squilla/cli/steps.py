@@ -117,6 +117,9 @@ def calibrate(
     ] = None,
     target: Annotated[Path | None, typer.Option(help="Frame of a textured plane.")] = None,
     target_distance: Annotated[float | None, typer.Option(help="Its distance, mm.")] = None,
+    shots: Annotated[
+        Path | None, typer.Option(help="Folder with hand-held shots of a textured plane.")
+    ] = None,
     camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
     as_json: Json = False,
 ) -> None:
@@ -149,6 +152,7 @@ def calibrate(
         known=None if scenes is None else track(scenes, "known scenes", disable=as_json),
         target=None if target is None else read_raw(target),
         target_distance=target_distance,
+        shots=() if shots is None else read_raws(shots),
     )
     calibration.save(output)
     if as_json:

@@ -1,0 +1,69 @@
+"""How well sub-images were aligned, and what that costs in colour."""
+
+import numpy as np
+from torch import Tensor
+
+from squilla.calibration.calibration import Lattice
+from squilla.calibration.disparity import Placement
+
+STALE = 0.1
+"""Shifts of units across their baselines from which on a lattice is taken to have moved, px."""
+
+COSTLY = 0.02
+"""Expected colour error from which on a person is warned."""
+
+
+def misalignment(found: Placement, lattice: Lattice) -> float:
+    """Return how far off the sub-images are expected to lie, RMS over units and field, px per axis.
+
+    The uncertainty of the plane by the noise, and what single units and single parts of the field
+    disagree with it beyond their own noise.
+    """
+    length = float(np.mean(lattice.baseline**2))
+    plane = length * float(np.diag(found.covariance) @ [1, 1 / 3, 1 / 3])  # y^2, x^2 over -1..1
+    noise = float(np.mean(found.uncertainty**2))
+    followed = found.offset.any()  # were single units free, they followed their noise
+    units = noise if followed else float(np.mean(found.leftover**2)) - noise
+    relief = length * float(np.median(found.relief**2 - found.flatness**2))
+    return float(np.sqrt(plane + max(units, 0) + max(relief, 0)))
+
+
+def drift(found: Placement, lattice: Lattice) -> float:
+    """Return how far units lie beside their places in the lattice, RMS px.
+
+    Only across each unit's baseline, where no depth of the scene moves anything, and beyond the
+    noise: what is left is a lattice that has moved since its calibration.
+    """
+    length = np.hypot(*lattice.baseline.T)
+    some = length > 0
+    across = (lattice.baseline[some] / length[some, None])[:, ::-1] * [1, -1]
+    shift = np.sum((found.leftover + found.offset)[some] * across, 1)
+    noise = np.sum((found.uncertainty[some] * across) ** 2, 1)
+    return float(np.sqrt(max(np.mean(shift**2 - noise), 0.0)))
+
+
+def colour_error(y: Tensor, noise: np.ndarray, shift: float) -> float:
+    """Return the relative error of a measurement whose channels are misplaced.
+
+    To first order a channel that lies off by d is wrong by d times its gradient.
+
+    Parameters
+    ----------
+    y : Tensor, (H, W, M)
+    noise : array, (M,)
+        Variance of each channel's noise.
+    shift : float
+        RMS misplacement of the channels, px per axis.
+
+    Returns
+    -------
+    float
+        RMS error over RMS of `y`.
+    """
+    few = y[::5].numpy()
+    across = float(np.mean((few[:, 2:] - few[:, :-2]) ** 2)) / 4
+    few = y[:, ::5].numpy()
+    down = float(np.mean((few[2:] - few[:-2]) ** 2)) / 4
+    of_noise = float(np.mean(noise)) / 2
+    slope = max(across - of_noise, 0) + max(down - of_noise, 0)
+    return float(shift * np.sqrt(slope / max(float(y[::5].square().mean()), 1e-30)))
