@@ -2,6 +2,7 @@
 
 import threading
 import time
+import traceback
 from collections import deque
 from typing import Any
 
