@@ -319,8 +319,9 @@ def priors_table(cells: list[dict]) -> str:
                 ]
                 if "–" not in found:
                     rows.append([NETWORKS[network], noise.replace(":", "–"), str(epochs), *found])
-    head = ["network", "noise (dB)", "epochs", "patch means: Gaussians", "broad",
-            "single pixels: Gaussians", "broad"]  # fmt: skip
+    head = ["network", "noise (dB)", "epochs"]
+    for name in PLACES.values():
+        head += [f"{name}: Gaussians", "broad"]
     return table(head, rows)
 
 
