@@ -73,7 +73,12 @@ PUBLISHED = {
 }
 """The thesis' table 5.1: real captures with its own camera, never mixed with ours."""
 
-PLACES = {"patch": "patch means", "single": "single pixels", "model": "20 dB of model error"}
+PLACES = {
+    "patch": "patch means",
+    "averaged": "mean measurement",
+    "single": "single pixels",
+    "model": "20 dB of model error",
+}
 """Errors as `judge` takes them."""
 
 KINDS = {
