@@ -73,7 +73,12 @@ PUBLISHED = {
 }
 """The thesis' table 5.1: real captures with its own camera, never mixed with ours."""
 
-PLACES = {"patch": "patch means", "single": "single pixels", "model": "20 dB of model error"}
+PLACES = {
+    "patch": "patch means",
+    "averaged": "mean measurement",
+    "single": "single pixels",
+    "model": "20 dB of model error",
+}
 """Errors as `judge` takes them."""
 
 KINDS = {
@@ -235,20 +240,25 @@ def shown(values: list[float]) -> str:
 
 
 def recipe_table(cells: list[dict]) -> str:
-    """Return the tables of one prior and number of epochs, the published figures beside them."""
+    """Return the tables of one prior and number of epochs.
+
+    The published figures stand beside those of the thesis' prior.
+    """
     networks = [name for name in NETWORKS if any(cell["model"] == name for cell in cells)]
+    beside = PUBLISHED if cells[0]["prior"] == "gaussian" else {noise: {} for noise in PUBLISHED}
     parts = []
     for place, name in PLACES.items():
         head = [f"{name}: noise (dB)"]
         for network in networks:
-            head += [NETWORKS[network]] + ["*thesis*"] * (network in PUBLISHED["none"])
+            head += [NETWORKS[network]] + ["*thesis*"] * (network in beside["none"])
         rows = []
-        for noise, published in PUBLISHED.items():
+        for noise, published in beside.items():
             row = [noise.replace(":", "–")]
             for network in networks:
                 row.append(shown(errors(cells, network, noise, place)))
                 row += [f"*{published[network]:.4f}*"] if network in published else []
-            rows.append(row)
+            if set(row[1:]) != {"–"}:
+                rows.append(row)
         parts.append(table(head, rows))
     return "\n\n".join(parts)
 
@@ -319,8 +329,9 @@ def priors_table(cells: list[dict]) -> str:
                 ]
                 if "–" not in found:
                     rows.append([NETWORKS[network], noise.replace(":", "–"), str(epochs), *found])
-    head = ["network", "noise (dB)", "epochs", "patch means: Gaussians", "broad",
-            "single pixels: Gaussians", "broad"]  # fmt: skip
+    head = ["network", "noise (dB)", "epochs"]
+    for name in PLACES.values():
+        head += [f"{name}: Gaussians", "broad"]
     return table(head, rows)
 
 
