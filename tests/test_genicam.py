@@ -113,11 +113,16 @@ def test_a_part_of_the_sensor(twin, frames):
 def test_a_trigger_takes_one_frame_each(twin):
     with open_camera(HERE) as camera:
         camera.trigger = "Software"
-        numbers = []
-        for _ in range(3):
+        fired = 0
+        while camera.statistics.delivered < 3:
             camera.fire()
-            numbers.append(camera.read().metadata["frame"])
-        assert np.diff(numbers).tolist() == [1, 1]
+            fired += 1
+            try:
+                camera.read(timeout=1.0)
+            except InputError:  # a busy computer loses packets, and nothing is sent twice
+                assert camera.statistics.incomplete > 0
+        counts = camera.statistics
+        assert counts.delivered + counts.incomplete + counts.lost == fired == twin.sent
         with pytest.raises(InputError, match="no trigger came at Software"):
             camera.read(timeout=0.3)
         camera.trigger = None
