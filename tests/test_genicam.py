@@ -113,11 +113,16 @@ def test_a_part_of_the_sensor(twin, frames):
 def test_a_trigger_takes_one_frame_each(twin):
     with open_camera(HERE) as camera:
         camera.trigger = "Software"
-        numbers = []
-        for _ in range(3):
+        fired = 0
+        while camera.statistics.delivered < 3:
             camera.fire()
-            numbers.append(camera.read().metadata["frame"])
-        assert np.diff(numbers).tolist() == [1, 1]
+            fired += 1
+            try:
+                camera.read(timeout=1.0)
+            except InputError:  # a busy computer loses packets, and nothing is sent twice
+                assert camera.statistics.incomplete > 0
+        counts = camera.statistics
+        assert counts.delivered + counts.incomplete + counts.lost == fired == twin.sent
         with pytest.raises(InputError, match="no trigger came at Software"):
             camera.read(timeout=0.3)
         camera.trigger = None
@@ -144,19 +149,22 @@ def test_a_slow_reader_gets_the_newest(twin):
 def test_settings_change_under_a_running_reader(twin, frames):
     """Every frame carries the exposure that it was taken with, whoever sets it."""
     with open_camera(HERE) as camera:
+        seen, shown = set(), threading.Condition()
 
         def change():
             for exposure in (2.0, 5.0, 3.0):
-                time.sleep(0.15)
                 camera.exposure = exposure
+                with shown:
+                    shown.wait_for(lambda exposure=exposure: exposure in seen, timeout=10)
 
         setter = threading.Thread(target=change)
         setter.start()
-        seen = set()
         for raw in camera.frames():
             np.testing.assert_array_equal(raw.frame[::50], sent(frames, raw)[::50])
-            seen.add(raw.exposure)
-            if not setter.is_alive() and raw.exposure == 3.0:
+            with shown:
+                seen.add(raw.exposure)
+                shown.notify()
+            if not setter.is_alive():
                 break
         setter.join()
         assert {2.0, 3.0, 5.0} <= seen
