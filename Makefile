@@ -8,7 +8,7 @@ THREADS ?= $(shell nproc)
 export OMP_NUM_THREADS = $(THREADS)
 export NUMBA_NUM_THREADS = $(THREADS)
 
-.PHONY: demo test test-all lint bench clean
+.PHONY: demo test test-all lint bench docs clean
 
 demo: $(READY)
 	$(BIN)/squilla demo -o demo
@@ -27,6 +27,10 @@ lint: $(READY)
 
 bench: $(READY)
 	for script in benchmarks/[a-z]*.py; do $(BIN)/python $$script || exit 1; done
+
+docs: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[docs]"
+	$(BIN)/mkdocs build
 
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "squilla needs Python 3.11 or newer; set PYTHON=python3.11")'

@@ -108,7 +108,7 @@ def test_a_depth_map_moves_things(bench, tmp_path):
         "reconstruct", tmp_path / "near.tiff", "--calibration", bench / "camera.nc",
         "-o", tmp_path / "near.nc", "--json",
     )  # fmt: skip
-    assert json.loads(printed)[0]["distance"] == pytest.approx(150, rel=0.02)
+    assert json.loads(printed)["distance"] == pytest.approx(150, rel=0.02)
 
 
 def test_a_depth_map_is_cut_and_resized_as_its_scene_is(tmp_path):
@@ -155,7 +155,7 @@ def test_models_and_help():
     commands = re.findall(r"^  ([a-z]+) ", run("--help").split("Commands:")[1], re.M)
     for command in commands:
         helped = run(command, "--help")
-        assert "Example:" in helped or "Commands:" in helped, command
+        assert re.search("Examples?:|Commands:", helped), command
 
 
 CAPTURE = "simulate chart -o {t}/raw.tiff --camera {b}/small.toml"

@@ -291,3 +291,11 @@ def test_composite_takes_the_thesis_bands():
     assert composite(np.zeros((2, 2, 251)), grid()).max() == 0
     light = lights()[CHART_LIGHT]
     np.testing.assert_allclose(composite(0.3 * light, grid(), white=light, scale=1), 0.3)
+
+
+def test_natural_spectra_are_stretched_to_a_band_beyond_the_tables():
+    near, far = grid(500, 750, 5), grid(400, 1000, 12)
+    drawn = [
+        natural_spectra(5, band, generator=torch.Generator().manual_seed(1)) for band in (near, far)
+    ]
+    torch.testing.assert_close(*drawn)

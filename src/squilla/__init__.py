@@ -13,11 +13,13 @@ _HOME = {
     "Raw": "files.raw",
     "read_raw": "files.raw",
     "read_scene": "files.cube",
+    "labelled": "files.cube",
     "load_cube": "files.cube",
     "save": "files.cube",
     "StencilRecipe": "optics.filters",
     "CameraDesign": "camera.design",
     "Camera": "camera.twin",
+    "load_scene": "camera.scenes",
     "Calibration": "calibration.calibration",
     "calibrate": "calibration.calibrate",
     "load_calibration": "calibration.store",
@@ -38,11 +40,12 @@ if TYPE_CHECKING:
     from squilla.calibration.calibration import Calibration
     from squilla.calibration.store import load_calibration
     from squilla.camera.design import CameraDesign
+    from squilla.camera.scenes import load_scene
     from squilla.camera.twin import Camera
     from squilla.errors import InputError
     from squilla.evaluation.metrics import evaluate
     from squilla.evaluation.plots import show
-    from squilla.files.cube import load_cube, read_scene, save
+    from squilla.files.cube import labelled, load_cube, read_scene, save
     from squilla.files.raw import Raw, read_raw
     from squilla.optics.filters import StencilRecipe
     from squilla.reconstruction.reconstructor import Reconstructor, load_model

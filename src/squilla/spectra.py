@@ -218,12 +218,20 @@ def natural_spectra(
     Two reflectances are mixed in a random proportion, half of the time with a white gloss; the
     evaluation light (`CHART_LIGHT`) is left out.
 
+    The tables cover 500-750 nm. A band that reaches beyond them is mapped onto theirs: a camera of
+    400-1000 nm meets natural spectra stretched to it, as varied and as smooth, if not its own.
+
     Returns
     -------
     Tensor, (count, K), float32, peak 1
     """
     import torch
 
+    known = reflectances().wavelength
+    wavelength = np.asarray(wavelength, float)
+    if wavelength[0] < known[0] - 1e-6 or wavelength[-1] > known[-1] + 1e-6:
+        share = (wavelength - wavelength[0]) / max(np.ptp(wavelength), 1e-9)
+        wavelength = known[0] + share * np.ptp(known)
     surface = torch.from_numpy(reflectances().on(wavelength)).float()
     keep = [name != CHART_LIGHT for name in lights().name]
     light = torch.from_numpy(lights().on(wavelength)[keep]).float()

@@ -12,6 +12,7 @@ from squilla.errors import InputError
 
 if TYPE_CHECKING:
     from squilla.calibration.sensitivity import SweepStep
+    from squilla.files.raw import Frame
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
@@ -139,7 +140,7 @@ def calibrate(
 
 
 def reconstruct(
-    raw: Annotated[list[Path], typer.Argument(help="Raw frames.")],
+    raw: Annotated[list[Path], typer.Argument(help="Raw frames: files, TIFFs of many, folders.")],
     calibration: Annotated[Path, typer.Option(help="Of the camera, .nc.")],
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Cube (.nc, .hdr, .tiff, .zarr), or a folder.")
@@ -148,43 +149,96 @@ def reconstruct(
     distance: Annotated[
         float | None, typer.Option(help="Of the scene, mm; default: found from it.")
     ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes for many frames; default: every core.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Of a Dask cluster for many frames, tcp://host:8786.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Turn raw frames into hyperspectral cubes.
 
-    Example: squilla reconstruct raw.tiff --calibration camera.nc --model ridge -o cube.nc
-    """
-    from rich.progress import track
+    Many frames go into a folder, a NetCDF file each, or into one .zarr along a dimension
+    "capture". A run that was interrupted goes on where it was when it is started again.
 
+    Examples: squilla reconstruct raw.tiff --calibration camera.nc --model ridge -o cube.nc;
+    squilla reconstruct night/ --calibration camera.nc --model mlp -o night.zarr
+    """
+    from squilla.files.raw import list_frames
+
+    frames = [frame for path in raw for frame in list_frames(path)]
+    into = output.is_dir() and output.suffix != ".zarr"
+    if len(frames) == 1 and not into:
+        _reconstruct_one(frames[0], calibration, model, output, distance, as_json)
+        return
+    if not into and output.suffix != ".zarr":
+        raise InputError(f"For several raw frames {output} must be an existing folder or a .zarr.")
+    _reconstruct_many(frames, calibration, model, output, distance, workers, scheduler, as_json)
+
+
+def _reconstruct_one(
+    frame: "Frame", calibration: Path, model: str, output: Path, distance: float | None,
+    as_json: bool,
+) -> None:  # fmt: skip
     from squilla.calibration.alignment import measure
     from squilla.calibration.store import load_calibration
     from squilla.files.cube import save
-    from squilla.files.raw import read_raw
     from squilla.reconstruction.reconstructor import load_model
 
-    many = len(raw) > 1
-    into = output.is_dir() and output.suffix != ".zarr"
-    if many and not into:
-        raise InputError(f"For several raw frames {output} must be an existing folder.")
-    names = [path.stem for path in raw]
-    if into and len(set(names)) < len(names):
-        raise InputError("Two raw frames have the same name; their cubes would be one file.")
     camera = load_calibration(calibration)
-    reconstructor = load_model(model, camera)
-    written = []
-    for path in track(raw, "frames", disable=as_json or not many):
-        measurement = measure(read_raw(path), camera, distance=distance)
-        target = output / f"{path.stem}.nc" if into else output
-        save(reconstructor.reconstruct(measurement), target)
-        written.append({"file": str(target), **measurement.provenance})
-    if as_json:
-        typer.echo(json.dumps(written))
-        return
-    for one in written:
-        typer.echo(
-            f"{one['file']}: {one['snr']:.1f} dB, plane at {one['distance']:.0f} mm "
-            f"({one['alignment']}, agreement {one['alignment_score']:.2f})"
+    measurement = measure(frame.read(), camera, distance=distance)
+    save(load_model(model, camera).reconstruct(measurement), output)
+    told = {"file": str(output), **measurement.provenance}
+    typer.echo(json.dumps(told) if as_json else _sentence(str(output), told))
+
+
+def _reconstruct_many(
+    frames: "list[Frame]", calibration: Path, model: str, output: Path, distance: float | None,
+    workers: int | None, scheduler: str | None, as_json: bool,
+) -> None:  # fmt: skip
+    from dataclasses import asdict
+
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    from squilla.batch import Recipe, reconstruct_all
+
+    columns = TextColumn("captures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), disable=as_json) as progress:
+        bar = progress.add_task("captures", total=len(frames))
+        summary = reconstruct_all(
+            frames,
+            Recipe(calibration, model, distance),
+            output,
+            workers=workers,
+            scheduler=scheduler,
+            progress=lambda ended, of: progress.update(bar, completed=ended, total=of),
         )
+    if as_json:
+        typer.echo(json.dumps(asdict(summary)))
+    else:
+        typer.echo(
+            f"{output}: {len(summary.done)} of {len(frames)} captures"
+            + (f", {summary.found} of them from an earlier run" if summary.found else "")
+        )
+        for name, why in summary.failed.items():
+            typer.echo(f"{name}: {why}", err=True)
+    if summary.failed:
+        raise typer.Exit(1)
+
+
+def _sentence(name: str, told: dict) -> str:
+    return (
+        f"{name}: {told['snr']:.1f} dB, plane at {told['distance']:.0f} mm "
+        f"({told['alignment']}, agreement {told['alignment_score']:.2f})"
+    )
 
 
 def evaluate(

@@ -301,7 +301,7 @@ def _open(
     if suffix == ".nc":
         return _open_dataset(path, variable, wavelength, kind="NetCDF")
     if suffix == ".zarr":
-        _need_zarr(path)
+        need_zarr(path)
         return _open_dataset(
             path, variable, wavelength, kind="Zarr", engine="zarr", consolidated=False
         )
@@ -370,7 +370,7 @@ def _write_netcdf(dataset: xr.Dataset, path: Path) -> None:
         dataset.to_netcdf(temporary, engine="h5netcdf")
 
 
-def _need_zarr(path: Path) -> None:
+def need_zarr(path: Path) -> None:
     try:
         import zarr  # noqa: F401
     except ImportError as error:
@@ -380,24 +380,33 @@ def _need_zarr(path: Path) -> None:
 
 
 def _write_zarr(dataset: xr.Dataset, path: Path) -> None:
-    _need_zarr(path)
-    from zarr.codecs import BloscCodec
-
+    need_zarr(path)
     if path.is_dir() and any(path.iterdir()) and not (path / "zarr.json").exists():
         raise InputError(f"{path} is a folder of other things; it is not replaced.")
+    with replacing(path, folder=True) as temporary:
+        dataset.to_zarr(
+            temporary, zarr_format=3, consolidated=False, encoding=zarr_encoding(dataset)
+        )
+
+
+def zarr_encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Return how the variables of a dataset are packed in a Zarr: tiles with their whole spectra.
+
+    So a point is read without the rest of the picture, and a capture without the others.
+    """
+    from zarr.codecs import BloscCodec
+
     packed = BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle")
-    encoding = {
-        name: {
+    tile = {"y": 128, "x": 128, "capture": 1}
+    return {
+        str(name): {
             "compressors": (packed,),
-            # Tiles with their whole spectra: a point is read without the rest of the picture.
             "chunks": tuple(
-                min(size, 128) if dim in ("y", "x") else size for dim, size in array.sizes.items()
+                min(size, tile.get(str(dim), size)) for dim, size in array.sizes.items()
             ),
         }
         for name, array in dataset.data_vars.items()
     }
-    with replacing(path, folder=True) as temporary:
-        dataset.to_zarr(temporary, zarr_format=3, consolidated=False, encoding=encoding)
 
 
 def _write_single(array: DataArray, path: Path) -> None:

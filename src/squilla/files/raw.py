@@ -36,6 +36,65 @@ class Raw:
             raise InputError(f"The exposure must be a time in ms, not {self.exposure}.")
 
 
+@dataclass(frozen=True)
+class Frame:
+    """Where one raw frame is: a file, and for a TIFF of several pages which of them, from 0."""
+
+    path: Path
+    page: int | None = None
+
+    @property
+    def name(self) -> str:
+        """The file's name without its suffix, and the number of the page."""
+        return self.path.stem + ("" if self.page is None else f"-{self.page:05d}")
+
+    def read(self) -> Raw:
+        """Read the frame; errors as in `read_raw`."""
+        if self.page is None:
+            return read_raw(self.path)
+        import tifffile
+
+        with reading(self.path, "TIFF"), tifffile.TiffFile(self.path) as tiff:
+            page = tiff.pages[self.page]
+            check_size(self.path, page.nbytes)
+            frame, facts = page.asarray(), _described(getattr(page, "description", ""))
+        return _raw(self.path, frame, facts)
+
+
+def list_frames(path: str | Path) -> list[Frame]:
+    """Return the frames of a file, or of a folder in the order of its names, without reading them.
+
+    Raises
+    ------
+    InputError
+        If nothing is there or a file cannot be a raw frame.
+    """
+    files = _files(existing(path))
+    return [frame for file in files for frame in _pages(file)]
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_dir():
+        inside = [file for file in path.iterdir() if file.suffix.lower() in _READERS]
+        if not inside:
+            raise InputError(f"The folder {path} holds no raw frame ({', '.join(_READERS)}).")
+        return sorted(inside, key=_natural)
+    if path.suffix.lower() not in _READERS:
+        raise InputError(f"{path} is none of the raw frames known: {', '.join(_READERS)}.")
+    return [path]
+
+
+def _pages(path: Path) -> list[Frame]:
+    if path.suffix.lower() in (".tif", ".tiff"):
+        import tifffile
+
+        with reading(path, "TIFF"), tifffile.TiffFile(path) as tiff:
+            count = len(tiff.pages)
+        if count > 1:
+            return [Frame(path, page) for page in range(count)]
+    return [Frame(path)]
+
+
 def read_raw(path: str | Path) -> Raw:
     """Read one raw frame: TIFF, PNG, NPY, or .raw with a JSON file beside it.
 
@@ -67,24 +126,18 @@ def read_raws(path: str | Path) -> Iterator[Raw]:
 
     One frame at a time is held in memory. Parameters and errors as in `read_raw`.
     """
-    path = existing(path)
-    if path.is_dir():
-        inside = [file for file in path.iterdir() if file.suffix.lower() in _READERS]
-        if not inside:
-            raise InputError(f"The folder {path} holds no raw frame ({', '.join(_READERS)}).")
-        for file in sorted(inside, key=_natural):
-            yield from read_raws(file)
-        return
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(f"{path} is none of the raw frames known: {', '.join(_READERS)}.")
-    for frame, facts in reader(path):
-        if frame.ndim != 2 or frame.dtype not in (np.uint8, np.uint16):
-            raise InputError(
-                f"{path} holds {frame.shape} of {frame.dtype}; a raw frame is one grey picture of "
-                "8 or 16-bit whole numbers, as the sensor gave it."
-            )
-        yield Raw(frame.astype(np.uint16, copy=False), *_facts(path, facts or _sidecar(path)))
+    for file in _files(existing(path)):
+        for frame, facts in _READERS[file.suffix.lower()](file):
+            yield _raw(file, frame, facts)
+
+
+def _raw(path: Path, frame: np.ndarray, facts: dict[str, Any]) -> Raw:
+    if frame.ndim != 2 or frame.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"{path} holds {frame.shape} of {frame.dtype}; a raw frame is one grey picture of "
+            "8 or 16-bit whole numbers, as the sensor gave it."
+        )
+    return Raw(frame.astype(np.uint16, copy=False), *_facts(path, facts or _sidecar(path)))
 
 
 def write_raw(path: str | Path, raw: Raw) -> None:

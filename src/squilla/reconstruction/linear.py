@@ -9,7 +9,7 @@ from torch import Tensor
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.reconstruction.reconstructor import Reconstructor
-from squilla.spectra import broad_spectra, reflectances
+from squilla.spectra import broad_spectra
 
 SNR = 20.0
 """Signal-to-noise ratio assumed where none is known, dB: what the thesis found for its camera."""
@@ -76,7 +76,7 @@ def _noise_to_signal(snr: Tensor | None, count: int, device: torch.device) -> Te
 def second_moment(calibration: Calibration) -> Tensor:
     """Return the mean of x x' over 20 000 spectra of the broad prior, (K, K), float64.
 
-    Outside 500-750 nm the prior is stretched; see `within_tables`.
+    Outside 500-750 nm its natural spectra are stretched; see `natural_spectra`.
     """
     return _second_moment(tuple(calibration.wavelength.tolist()))
 
@@ -84,31 +84,8 @@ def second_moment(calibration: Calibration) -> Tensor:
 @lru_cache(maxsize=4)  # every capture with an invalid pixel needs it
 def _second_moment(wavelength: tuple[float, ...]) -> Tensor:
     generator = torch.Generator().manual_seed(0)
-    spectra = broad_spectra(20_000, within_tables(np.array(wavelength)), generator=generator)
+    spectra = broad_spectra(20_000, np.array(wavelength), generator=generator)
     return (spectra.T @ spectra).double() / len(spectra)
-
-
-def within_tables(wavelength: np.ndarray) -> np.ndarray:
-    """Return wavelengths at which natural spectra can be drawn for a band.
-
-    They are the band's own where the measured tables (500-750 nm) cover it. Otherwise the band is
-    mapped onto the tables': a camera of 400-1000 nm meets natural spectra stretched to its band,
-    which are as varied and as smooth, if not its own.
-
-    Parameters
-    ----------
-    wavelength : array, (K,)
-        nm.
-
-    Returns
-    -------
-    array, (K,), nm
-    """
-    known = reflectances().wavelength
-    if known[0] - 1e-6 <= wavelength[0] and wavelength[-1] <= known[-1] + 1e-6:
-        return wavelength
-    share = (wavelength - wavelength[0]) / max(np.ptp(wavelength), 1e-9)
-    return known[0] + share * np.ptp(known)
 
 
 def complete(

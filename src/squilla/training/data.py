@@ -9,7 +9,6 @@ from torch import Tensor
 
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
-from squilla.reconstruction.linear import within_tables
 from squilla.spectra import PRIORS
 from squilla.training.noise import Noise, add_noise
 
@@ -45,10 +44,7 @@ class Samples:
     def draw(self, epoch: int) -> Tensor:
         """Return the spectra of an epoch, (count, K), each with a maximum of 1."""
         generator = self._generator(epoch if self.fresh else 0, 0)
-        wavelength = self.calibration.wavelength
-        if self.spectra in ("broad", "natural"):
-            wavelength = within_tables(wavelength)
-        return PRIORS[self.spectra](self.count, wavelength, generator=generator)
+        return PRIORS[self.spectra](self.count, self.calibration.wavelength, generator=generator)
 
     def batches(self, epoch: int, size: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Yield the samples of an epoch in random order, `size` at a time.
