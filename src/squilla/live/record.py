@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from squilla.errors import InputError
+from squilla.files.cube import need_zarr, zarr_encoding
 from squilla.files.raw import Raw, write_raw
 from squilla.live.stored import StoredCube
 
@@ -39,6 +40,8 @@ class Recorder:
             _WAITING
         )
         self._thread: threading.Thread | None = None
+        if self.cubes:
+            need_zarr(path)
         if self.cubes and path.exists():
             raise InputError(f"{path} exists already; name another to record to.")
         try:
@@ -91,18 +94,11 @@ class Recorder:
                 self.error = str(error)
 
     def _append(self, stored: StoredCube) -> None:
-        from zarr.codecs import BloscCodec
-
         cube = stored.cube.astype(np.float32).rename("radiance").expand_dims("time")
         cube.attrs = {}
         dataset = cube.to_dataset()
         if self.path.exists():
             dataset.to_zarr(self.path, append_dim="time", zarr_format=3, consolidated=False)
-            return
-        packed = BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")
-        encoding = {"radiance": {"compressors": (packed,), "chunks": (1, *_tiles(cube.shape[1:]))}}
-        dataset.to_zarr(self.path, zarr_format=3, consolidated=False, encoding=encoding)
-
-
-def _tiles(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return (min(shape[0], 128), min(shape[1], 128), shape[2])
+        else:
+            packing = zarr_encoding(dataset)
+            dataset.to_zarr(self.path, zarr_format=3, consolidated=False, encoding=packing)

@@ -60,14 +60,16 @@ const live = new Live({ connection, show, spectra, arrived: (item) => arrived(it
 
 function greet(header) {
   warn("");
+  const first = !sources.length;
   sources = header.sources;
   show.store.clear();
-  if (!spectra.references.length) addReferences(header.references);
   $("tabs").replaceChildren(...sources.map((source, at) => element("button", {
-    role: "tab", id: `tab-${at}`, className: source.error ? "broken" : "", title: source.title, onclick: () => open(at),
+    role: "tab", id: `tab-${at}`, className: source.error ? "broken" : "", onclick: () => open(at),
+    title: Object.entries(source.facts ?? {}).map(([name, value]) => `${name}: ${value}`).join("\n"),
   }, source.title)));
   $("origin").textContent = `squilla ${header.hello}`;
   open(Math.min(number, sources.length - 1));
+  if (first) addReferences(header.references);
 }
 
 function open(at) {
@@ -345,6 +347,8 @@ async function fetchOther(reference) {
 }
 
 function drawPlot() {
+  const { quantity, unit } = sources[number];
+  $("quantity").textContent = spectra.scaled ? "relative" : [quantity, unit].filter(Boolean).join(", ");
   plot.lines = spectra.lines(colour);
   $("plot-empty").hidden = plot.lines.length > 0;
   plot.draw();
@@ -436,7 +440,7 @@ async function readReferences(file) {
 function setTheme(name) {
   root.dataset.theme = name;
   mark();
-  drawPlot();
+  if (sources.length) drawPlot();
   contrast.draw();
 }
 

@@ -33,7 +33,6 @@ export class Plot {
     this.colours = [];
     this.marker = null;
     this.hair = null;
-    this.unit = "";
     new ResizeObserver(() => this.resize()).observe(canvas);
     const at = (event) => this.nanometres(event.offsetX);
     canvas.addEventListener("pointermove", (event) => {
