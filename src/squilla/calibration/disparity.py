@@ -29,6 +29,9 @@ such differences would look like shifts.
 _FAINT = 1.3
 """Variance in units of the noise's from which on a picture is taken to be one of the mixture."""
 
+_NEAR = 0.02
+"""Last change of a shift from which on Gauss-Newton steps end, px; they converge quadratically."""
+
 _PARTS = 5
 """Rows and columns of parts of the field in which it is seen whether the scene is a plane."""
 
@@ -122,7 +125,7 @@ def find_plane(
             step, moved, covariance = _solve(found, lattice, plane, offset, free)
             plane, offset = plane + step, offset + moved
             change = max(np.abs(step).max() * _reach(lattice), np.abs(moved).max())
-            if change < 0.01 * level.step:
+            if change < _NEAR:
                 break
     pull, precision = found.relief
     leftover, uncertainty = _single(found)
@@ -186,28 +189,28 @@ def compare(
     place[..., 0] += corner
     place = place * scale / edges.step
     units, points = len(first), shape[0] * shape[1]
-    values = np.empty((2, units, *shape), np.float32)
+    values = np.empty((units, 2, *shape), np.float32)
     seen = np.empty((units, *shape), bool)
     baseline = lattice.baseline / edges.step
-    resample(edges.values, edges.bad, place, baseline, disparity, CUBIC, values, seen)
-    values *= seen
-    seen = seen.reshape(units, points).astype(np.float32)
-    values, seen = values.swapaxes(0, 1).reshape(units, -1), np.tile(seen, 2)
-    common, share, spread, score = _common(values, seen, rank)
+    into = values.swapaxes(0, 1)
+    resample(edges.values, edges.bad, place, baseline, disparity, CUBIC, into, seen)
+    values = values.reshape(units, 2 * points)
+    common, share, spread, score = _common(values, seen.reshape(units, points), rank)
     rank = share.shape[1]
-    misfit = seen * (values / spread[:, None] - share @ common)
     slopes = _slopes(common.reshape(2 * rank, *shape)).reshape(rank, 2, 2, points) / edges.step
     slopes = slopes.swapaxes(1, 2)  # (rank, axis, part, points)
     moves = slopes[:, :, None] * grid[:terms, None].reshape(terms, 1, points).astype(np.float32)
     moves = moves.reshape(rank * 2 * terms, 2 * points)
-    pull = (misfit @ moves.T).reshape(units, rank, 2 * terms)
+    misfit = (values @ moves.T) / spread[:, None] - share @ (common @ moves.T)
     gram = (moves @ moves.T).reshape(rank, 2 * terms, rank, 2 * terms).astype(float)
     free = np.eye(units) - share @ share.T
-    precision = np.einsum("ij,ir,js,rasb->iajb", free, share, share, gram, optimize=True)
+    half = np.einsum("ir,rasb->iasb", share, gram)
+    precision = np.einsum("ij,iasb,js->iajb", free, half, share, optimize=True)
     return Evidence(
-        -np.einsum("mr,mra->ma", share, pull.astype(float)) / edges.shared,
+        -np.einsum("mr,mra->ma", share, misfit.reshape(units, rank, -1)) / edges.shared,
         precision / edges.shared,
-        _relief(misfit, share, free, slopes, lattice.baseline, shape) / edges.shared,
+        _relief(values, common, share, spread, free, slopes, lattice.baseline, shape)
+        / edges.shared,
         score,
     )
 
@@ -218,7 +221,8 @@ def _common(values: np.ndarray, seen: np.ndarray, rank: int) -> tuple:
     Parameters
     ----------
     values : array, (M, 2 P)
-    seen : array, (M, 2 P), 0 or 1
+        Real parts, then imaginary parts; what is not seen is filled in from the others.
+    seen : array, (M, P) bool
     rank : int
         Most pictures that the units' edges are taken to be mixed from.
 
@@ -230,22 +234,29 @@ def _common(values: np.ndarray, seen: np.ndarray, rank: int) -> tuple:
     score : float
     """
     points = values.shape[1] // 2
+    gaps = not seen.all()
+    if gaps:
+        whole = values.reshape(len(values), 2, points)
+        whole *= seen[:, None]
+        mean = whole.sum(0) / (seen.sum(0) + 1e-9)
+        share = np.einsum("mcp,cp->m", whole, mean) / (seen @ np.square(mean).sum(0) + 1e-9)
+        missing = ~seen
+        for part in (0, 1):
+            whole[:, part][missing] = (share[:, None] * mean[part])[missing]
     halves = [values[:, start : start + points // 2] for start in (0, points)]
     upper = sum(half @ half.T for half in halves).astype(float)
-    whole = (values @ values.T).astype(float)
-    strength, vectors = np.linalg.eigh(whole)
-    alone = np.diag(whole) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
-    spread = np.sqrt(np.maximum(alone / (seen.sum(1) + 1e-9), 1e-5))
-    strength, vectors = np.linalg.eigh(whole / np.outer(spread, spread))
+    halves = [values[:, start + points // 2 : start + points] for start in (0, points)]
+    lower = sum(half @ half.T for half in halves).astype(float)
+    strength, vectors = np.linalg.eigh(upper + lower)
+    alone = np.diag(upper + lower) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
+    spread = np.sqrt(np.maximum(alone / values.shape[1], 1e-5))
+    strength, vectors = np.linalg.eigh((upper + lower) / np.outer(spread, spread))
     clear = int(np.sum(strength > _FAINT * values.shape[1]))
     rank = max(1, min(rank, len(values) // 6, clear))
-    share = vectors[:, : -1 - rank : -1].astype(np.float32)
-    common = (share / spread[:, None].astype(np.float32)).T @ values
-    if not seen.all():  # what a unit does not see is taken from the others
-        scaled = values / spread[:, None].astype(np.float32)
-        common = share.T @ np.where(seen, scaled, share @ common)
-    score = (_agreement(upper, whole - upper) + _agreement(whole - upper, upper)) / 2
-    return common, share, spread.astype(np.float32), score
+    share = vectors[:, : -1 - rank : -1]
+    common = (share / spread[:, None]).T.astype(np.float32) @ values
+    score = (_agreement(upper, lower) + _agreement(lower, upper)) / 2
+    return common, share, spread, score
 
 
 def _agreement(one: np.ndarray, other: np.ndarray) -> float:
@@ -261,12 +272,14 @@ def _agreement(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.mean(np.sign(share) * alike))  # some units may show the negative
 
 
-def _relief(misfit, share, free, slopes, baseline, shape) -> np.ndarray:
+def _relief(values, common, share, spread, free, slopes, baseline, shape) -> np.ndarray:
     """Return pull and precision of the disparity in each part of the field, (2, B, B)."""
     rank, points = share.shape[1], shape[0] * shape[1]
     along = (baseline.T[None] * share.T[:, None]).reshape(2 * rank, -1)  # (rank axis, M)
     slopes = slopes.reshape(2 * rank, -1)
-    pull = -((along @ misfit).astype(np.float32) * slopes).sum(0)
+    misfit = (along / spread).astype(np.float32) @ values
+    misfit -= (along @ share).astype(np.float32) @ common
+    pull = -(misfit * slopes).sum(0)
     precision = ((along @ free @ along.T).astype(np.float32) @ slopes * slopes).sum(0)
     rows, columns = (np.arange(size) * _PARTS // size for size in shape)
     part = (rows[:, None] * _PARTS + columns).ravel()
@@ -340,13 +353,13 @@ def _search(edges: Edges, lattice: Lattice, first: np.ndarray, span: tuple[float
     spectra = whole[:, rows[:, None], columns]
     angle_y = 2j * np.pi / edges.step * torch.fft.fftfreq(whole.shape[1])[rows]
     angle_x = 2j * np.pi / edges.step * torch.fft.fftfreq(whole.shape[2])[columns]
-    # The outermost unit moves by 1 px from one to the next.
-    candidates = np.arange(span[0] * reach - 1, span[1] * reach + 2) / reach
+    # The outermost unit moves by 2 px from one to the next.
+    candidates = np.arange(span[0] * reach - 2, span[1] * reach + 3, 2) / reach
     total = []
     for candidate in candidates:
         shift = torch.from_numpy(first + candidate * lattice.baseline).float()
         along, across = torch.exp(shift[:, :1] * angle_y), torch.exp(shift[:, 1:] * angle_x)
-        together = torch.einsum("mhw,mh,mw->hw", spectra, along, across)
+        together = (spectra * along[:, :, None] * across[:, None]).sum(0)
         total.append(float(together.abs().square().sum()))
     return float(candidates[int(np.argmax(total))])
 
