@@ -263,6 +263,24 @@ def test_proper_barriers_vignette_no_crop_and_let_no_ghost_in(barrier):
             assert lens.vignetting(design, unit, sign * outside, inside).max() < 1e-3
 
 
+@pytest.mark.parametrize("name", ["thesis", "band-pass", "tombo", "linear-variable"])
+def test_the_stops_that_ship_light_every_crop_and_none_twice(name):
+    """In focus, where parallax has moved the crops outwards."""
+    design = CameraDesign.load(name)
+    half = design.field.size / 2
+    apart = (design.centres - design.centres[design.field.reference]) / design.pitch
+    parallax = design.array.pitch / 1000 * design.focal / design.lens.focus_distance * apart
+    for unit in range(design.units):
+        crop = np.linspace(-half, half, 9)[:, None] + parallax[unit]
+        share = lens.vignetting(design, unit, *crop.T)
+        fall = (1 + (np.add.outer(*(crop.T**2))) / design.focal**2) ** -2.0
+        assert np.all(share > 0.9 * fall)
+        for side in (-1, 1):
+            beyond = np.array([side * (design.pitch - half)])
+            assert lens.vignetting(design, unit, beyond, crop[:, 1]).max() < 1e-3
+            assert lens.vignetting(design, unit, crop[:, 0], beyond).max() < 1e-3
+
+
 def test_shorter_walls_or_a_nearer_stop_let_ghosts_in():
     tree = CameraDesign.load("thesis").model_dump()
     for barrier in (
