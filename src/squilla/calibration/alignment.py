@@ -93,12 +93,7 @@ def measure(
     views = sub_images(raw, lattice, pixels, margin)
     snr = _judge(views, raw, pixels)
     score, relief, seen = 1.0, None, True
-    if depth:
-        noise = _noise_variance(views, pixels)
-        disparity, deviation, seen = find_depth(views, lattice, noise, lattice.disparity(nearest))
-        relief = Depth.of(disparity, deviation, lattice)
-        score, how = float(relief.confident.float().mean()), "a distance for every point"
-    elif distance is not None:
+    if distance is not None:
         disparity, how = lattice.disparity(distance), "from the given distance"
     else:
         noise = _noise_variance(views, pixels)
@@ -109,6 +104,12 @@ def measure(
         how = "from the scene"
         if score < _TEXTURED:
             disparity, how = lattice.disparity(lattice.usual), "no texture: at the usual distance"
+        if depth:
+            disparity, deviation, seen = find_depth(
+                views, lattice, noise, lattice.disparity(nearest), disparity
+            )
+            relief = Depth.of(disparity, deviation, lattice)
+            score, how = float(relief.confident.float().mean()), "a distance for every point"
     y, valid = align(views, lattice, disparity)
     snr_of_point = _pointwise_snr(y, pixels)
     y = y / (raw.exposure or 1.0)
