@@ -41,7 +41,7 @@ from squilla.reconstruction.reconstructor import load_model
 from squilla.spectra import CHART_LIGHT, lights, reflectances
 
 RESULTS = Path(__file__).parent.parent / "experiments" / "results" / "depth.json"
-NEAREST = 90.0
+NEAREST = 80.0
 """Shortest distance that every method looks for, mm."""
 
 
@@ -231,6 +231,12 @@ def stereo_pairs(take: Take, views: SubImages, noise: np.ndarray) -> np.ndarray:
     return middle[tuple(nearest)].astype(np.float32)
 
 
+def every_point(take: Take, views: SubImages, noise: np.ndarray):
+    """What `measure(..., depth=True)` does: the plane first, then every point."""
+    usual = one_shift(take, views, noise)
+    return dense.find_depth(views, take.lattice, noise, take.lattice.disparity(NEAREST), usual)
+
+
 METHODS: dict[str, Callable[[Take, SubImages, np.ndarray], np.ndarray]] = {
     "one shift per sub-image": one_shift,
     "2-D patch matching": patch_matching,
@@ -272,10 +278,9 @@ def compared(take: Take, snr: float) -> dict:
         seen = None if method is one_shift else dense._seen(found, baseline)
         error = take.cube_error(found, seen)
         rows[name] = judged(take, found) | {"cube_error": error, "seconds": seconds}
-    nearest = take.lattice.disparity(NEAREST)
-    dense.find_depth(views, take.lattice, noise, nearest)
+    every_point(take, views, noise)
     start = time.process_time()
-    found, deviation, seen = dense.find_depth(views, take.lattice, noise, nearest)
+    found, deviation, seen = every_point(take, views, noise)
     seconds = time.process_time() - start
     rows["squilla"] = judged(take, found, deviation <= dense._SURE) | {
         "cube_error": take.cube_error(found, seen),
@@ -315,9 +320,7 @@ def flat(camera: Camera, calibration: Calibration, name: str, distance: float = 
     take = Take(camera, calibration, scene, np.full(scene.shape[:2], distance), 5)
     views, noise = take.views(take.raws(20.0)[0])
     once = one_shift(take, views, noise)
-    found, deviation, seen = dense.find_depth(
-        views, take.lattice, noise, take.lattice.disparity(NEAREST)
-    )
+    found, deviation, seen = every_point(take, views, noise)
     return {
         "one shift": judged(take, once) | {"cube_error": take.cube_error(once, None)},
         "squilla": judged(take, found, deviation <= dense._SURE)
@@ -332,9 +335,7 @@ def ranged(camera: Camera, calibration: Calibration, distance: float) -> dict:
     )
     take = Take(camera, calibration, scene, depth, 11)
     views, noise = take.views(take.raws(30.0)[0])
-    disparity, deviation, _ = dense.find_depth(
-        views, take.lattice, noise, take.lattice.disparity(min(NEAREST, 0.85 * distance))
-    )
+    disparity, deviation, _ = every_point(take, views, noise)
     found = dense.Depth.of(disparity, deviation, take.lattice)
     sure = found.confident.numpy()
     error = np.abs(found.distance.numpy() - depth)[sure]

@@ -117,12 +117,7 @@ def measure(
     snr = _judge(views, raw, pixels)
     noise = _noise_variance(views, pixels)
     relief, seen = None, True
-    if depth:
-        disparity, deviation, seen = find_depth(views, lattice, noise, largest)
-        relief = Depth.of(disparity, deviation, lattice)
-        score = float(relief.confident.float().mean())
-        quality = {"alignment": "a distance for every point", "alignment_score": score}
-    elif distance is not None:
+    if distance is not None:
         disparity = np.full(lattice.field, lattice.disparity(distance), np.float32)
         quality = {"alignment": "from the given distance", "alignment_score": 1.0}
     else:
@@ -133,6 +128,11 @@ def measure(
             return measure(raw, calibration, nearest=nearest, refine=refine)  # another scene
         views = replace(views, offset=views.offset + offset)
         disparity = plane_map(plane, lattice).astype(np.float32)
+        if depth:
+            disparity, deviation, seen = find_depth(views, lattice, noise, largest, disparity)
+            relief = Depth.of(disparity, deviation, lattice)
+            score = float(relief.confident.float().mean())
+            quality = {"alignment": "a distance for every point", "alignment_score": score}
     y, valid = align(views, lattice, disparity)
     snr_of_point = pointwise_snr(y, pixels)
     signal = float(y.mean())

@@ -38,6 +38,9 @@ _HALF = 0.06
 _SLANT, _JUMP = 0.02, 1.0
 """Prices of a step by one plane and of a jump, in the typical spread of the evidence."""
 
+_CLEAR = 0.055
+"""Share of the energy that a neighbourhood has to explain better to contradict a plane."""
+
 _SURE = 0.1
 """Expected standard deviation of the disparity, px per pitch, up to which a point is believed."""
 
@@ -89,7 +92,7 @@ class Depth:
 
 
 def find_depth(
-    views: "SubImages", lattice: Lattice, noise: np.ndarray, nearest: float
+    views: "SubImages", lattice: Lattice, noise: np.ndarray, nearest: float, usual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the disparity of every point of the reference view.
 
@@ -102,6 +105,8 @@ def find_depth(
         Variance of each sub-image's noise, DN^2.
     nearest : float
         Largest disparity looked for, px per lens pitch.
+    usual : array, (H, W)
+        Disparity to assume where nothing is to be seen anywhere around, px per pitch.
 
     Returns
     -------
@@ -144,7 +149,9 @@ def find_depth(
     )  # fmt: skip
     evidence -= 2  # what noise alone gives: two components of variance one
     rough = _lowest(_smoothed(cost, evidence), planes)
-    disparity = _settled(rough, evidence, _picture(views, lattice, level, rough))
+    if not _is_relief(cost, planes, rough, usual):
+        rough = usual.astype(np.float32)
+    disparity = _settled(rough, evidence, _picture(views, lattice, level, rough), usual)
     # Cramer-Rao: a unit tells of a shift by its slope across the noise, of disparity by its
     # baseline against the mean of all.
     share = weight**2 / (weight**2).sum()
@@ -370,6 +377,22 @@ def _lowest(total: np.ndarray, planes: np.ndarray) -> np.ndarray:
     return (planes[place] + part * (planes[1] - planes[0])).astype(np.float32)
 
 
+def _is_relief(cost: np.ndarray, planes: np.ndarray, rough: np.ndarray, usual: np.ndarray) -> bool:
+    """Return whether a disparity map explains clearly more than one plane does, somewhere.
+
+    A picture that is smooth everywhere shows its distance only as a whole: its single points follow
+    the noise.
+    """
+
+    def at(disparity):
+        place = np.rint((disparity - planes[0]) / (planes[1] - planes[0])).astype(int)
+        place = np.clip(place, 0, len(planes) - 1)
+        return np.take_along_axis(cost, place[..., None], -1)[..., 0]
+
+    gain = gaussian_filter(at(usual) - at(rough), 3.0)
+    return float(np.mean(gain > _CLEAR)) > 0.005
+
+
 # --- filling ----------------------------------------------------------------------------------
 
 _REACH, _CONTRAST = 10.0, 0.04
@@ -396,7 +419,9 @@ def _picture(
     return gaussian_filter((values[0] / level[near, None, None]).mean(0), 0.6)
 
 
-def _settled(rough: np.ndarray, evidence: np.ndarray, picture: np.ndarray) -> np.ndarray:
+def _settled(
+    rough: np.ndarray, evidence: np.ndarray, picture: np.ndarray, usual: np.ndarray
+) -> np.ndarray:
     """Smooth a disparity map within the surfaces that the picture shows, and fill its gaps.
 
     Minimises sum w (d - rough)^2 + sum a (d_p - d_q)^2 over neighbours, a falling with their
@@ -409,9 +434,9 @@ def _settled(rough: np.ndarray, evidence: np.ndarray, picture: np.ndarray) -> np
     bonds = [np.exp(-np.abs(np.diff(picture, axis=axis)) / _CONTRAST) for axis in (1, 0)]
     along, down = (np.ascontiguousarray(bond, np.float32) for bond in (bonds[0], bonds[1].T))
     # Where nothing is to be seen stands, to begin with, what stands anywhere around.
-    far = _averaged(rough, believed + 1e-6, along, down, 8 * _REACH)
-    rough = np.where(textured, rough, far)
-    believed += 1e-5
+    far = usual + _averaged(rough - usual, believed, along, down, 8 * _REACH, 1e-4)
+    rough = np.where(textured, rough, far.astype(np.float32))
+    believed = believed + np.float32(1e-5)
     weight = believed
     for _ in range(6):
         disparity = _averaged(rough, weight, along, down, _REACH)
@@ -422,10 +447,16 @@ def _settled(rough: np.ndarray, evidence: np.ndarray, picture: np.ndarray) -> np
 
 
 def _averaged(
-    values: np.ndarray, weight: np.ndarray, along: np.ndarray, down: np.ndarray, reach: float
+    values: np.ndarray,
+    weight: np.ndarray,
+    along: np.ndarray,
+    down: np.ndarray,
+    reach: float,
+    none: float = 1e-30,
 ) -> np.ndarray:
+    """Return weighted means over surfaces; they go to zero where the weight falls below `none`."""
     both = _diffuse(np.stack([weight * values, weight]), along, down, reach)
-    return both[0] / np.maximum(both[1], 1e-30)
+    return both[0] / (both[1] + np.float32(none))
 
 
 def _diffuse(fields: np.ndarray, along: np.ndarray, down: np.ndarray, reach: float) -> np.ndarray:
