@@ -173,7 +173,7 @@ class SubImages:
     offset : (M, 2) px; where in its image each unit sees an infinitely distant point on the axis,
         against the middle.
     margin : px.
-    saturated : share of saturated pixels.
+    saturated : share of saturated pixels, margins and all.
     """
 
     image: Tensor
@@ -188,34 +188,47 @@ def sub_images(raw: Raw, lattice: Lattice, pixels: Pixels, margin: int) -> SubIm
 
     Bad pixels are filled with the mean of their good neighbours.
     """
-    origin, frame = windows(raw.frame, lattice, margin)
-    flat, valid = (
-        windows(pixels.flat, lattice, margin)[1],
-        windows(pixels.valid, lattice, margin)[1],
-    )
-    bias = windows(pixels.bias, lattice, margin)[1]
-    rate = windows(pixels.dark_rate, lattice, margin)[1]
-    image = np.empty(frame.shape, np.float32)
-    bad = np.empty(frame.shape, bool)
-    exposure = np.float32(raw.exposure or 0.0)
-    _correct(frame, bias, rate, exposure, flat, valid, np.float32(pixels.saturation), image, bad)
+    origin = _corners(lattice, margin)
+    height, width = (size + 2 * margin for size in lattice.field)
+    image = np.zeros((len(origin), height, width), np.float32)
+    bad = np.ones(image.shape, bool)
+    exposure, saturation = np.float32(raw.exposure or 0.0), np.float32(pixels.saturation)
+    saturated = np.zeros((len(origin), height), np.int64)
+    _correct(
+        raw.frame, pixels.bias, pixels.dark_rate, exposure, pixels.flat, pixels.valid, saturation,
+        origin, image, bad, saturated,
+    )  # fmt: skip
     _fill(image, bad)
     offset = lattice.centre - origin - (np.array(lattice.field) - 1) / 2 - margin
-    saturated = float(np.mean(_inner(frame, margin) >= pixels.saturation))
-    return SubImages(torch.from_numpy(image), torch.from_numpy(bad), offset, margin, saturated)
+    share = float(saturated.sum() / image.size)
+    return SubImages(torch.from_numpy(image), torch.from_numpy(bad), offset, margin, share)
 
 
 @numba.njit(parallel=True, cache=True)
-def _correct(frame, bias, rate, exposure, flat, valid, saturation, image, bad):
-    units, rows, columns = frame.shape
-    for line in numba.prange(units * rows):
-        unit, row = line // rows, line % rows
-        for column in range(columns):
-            level = np.float32(frame[unit, row, column])
-            dark = bias[unit, row, column] + exposure * rate[unit, row, column]
-            wrong = not valid[unit, row, column] or level >= saturation
-            bad[unit, row, column] = wrong
-            image[unit, row, column] = (level - dark) / flat[unit, row, column] if not wrong else 0
+def _correct(
+    frame, bias, rate, exposure, flat, valid, saturation, origin, image, bad, saturated
+):  # fmt: skip
+    units, height, width = image.shape
+    rows, columns = frame.shape
+    for line in numba.prange(units * height):
+        unit, row = line // height, line % height
+        y, left = origin[unit, 0] + row, origin[unit, 1]
+        start, stop = max(left, 0), min(left + width, columns)
+        if y < 0 or y >= rows or stop <= start:
+            continue
+        values, flags = image[unit, row, start - left : stop - left], bad[unit, row, start - left :]
+        level, usable = frame[y, start:stop], valid[y, start:stop]
+        dark, slope, share = bias[y, start:stop], rate[y, start:stop], flat[y, start:stop]
+        count = 0
+        for n in range(stop - start):
+            light = np.float32(level[n])
+            over = light >= saturation
+            wrong = over or not usable[n]
+            count += over
+            flags[n] = wrong
+            value = (light - dark[n] - exposure * slope[n]) / share[n]
+            values[n] = np.float32(0) if wrong else value
+        saturated[unit, row] = count
 
 
 @numba.njit(parallel=True, cache=True)
@@ -244,8 +257,7 @@ def windows(image: np.ndarray, lattice: Lattice, margin: int) -> tuple[np.ndarra
         Frame position of each window's first pixel.
     images : array, (M, H + 2 margin, W + 2 margin); zero outside the sensor.
     """
-    half = (np.array(lattice.field) - 1) / 2
-    origin = np.floor(lattice.centre - half).astype(int) - margin
+    origin = _corners(lattice, margin)
     height, width = (size + 2 * margin for size in lattice.field)
     images = np.zeros((len(origin), height, width), image.dtype)
     for window, (y, x) in zip(images, origin, strict=True):
@@ -253,6 +265,12 @@ def windows(image: np.ndarray, lattice: Lattice, margin: int) -> tuple[np.ndarra
         part = image[top : max(y + height, 0), left : max(x + width, 0)]
         window[top - y : top - y + part.shape[0], left - x : left - x + part.shape[1]] = part
     return origin, images
+
+
+def _corners(lattice: Lattice, margin: int) -> np.ndarray:
+    """Return the frame position of each window's first pixel, (M, 2) int."""
+    half = (np.array(lattice.field) - 1) / 2
+    return np.floor(lattice.centre - half).astype(int) - margin
 
 
 def _noise_variance(views: SubImages, pixels: Pixels) -> np.ndarray:
