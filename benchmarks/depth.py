@@ -28,9 +28,8 @@ from scipy import ndimage
 
 import squilla
 from squilla.calibration import depth as dense
-from squilla.calibration.alignment import SubImages, align, measure, sub_images, windows
+from squilla.calibration.alignment import SubImages, align, measure, place, sub_images, windows
 from squilla.calibration.calibration import Calibration
-from squilla.calibration.disparity import edges, find_disparity
 from squilla.calibration.rehearsal import Rehearsal
 from squilla.camera.scenes import load_scene
 from squilla.camera.solid import solid_scene
@@ -137,10 +136,8 @@ def _aligned_at(take: Take, pictures: np.ndarray, views: SubImages, disparity: f
 
 
 def one_shift(take: Take, views: SubImages, noise: np.ndarray) -> np.ndarray:
-    features = edges(views.image.numpy(), noise, views.bad.numpy())
-    largest = take.lattice.disparity(NEAREST)
-    found, _ = find_disparity(features, views.offset, take.lattice.baseline, largest)
-    return np.full(take.lattice.field, found, np.float32)
+    plane, _, _ = place(views, take.lattice, take.lattice.disparity(NEAREST), noise=noise)
+    return np.full(take.lattice.field, plane[0], np.float32)
 
 
 def patch_matching(take: Take, views: SubImages, noise: np.ndarray, side: int = 11) -> np.ndarray:

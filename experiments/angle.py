@@ -58,6 +58,7 @@ def main() -> None:
         "difference_of_R": differences(cameras),
         "linear": linear(cameras),
         "spectra": spectra(cameras),
+        "levelling": levelling(cameras["true"]),
     }
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")
     if options.frames:
@@ -162,22 +163,45 @@ def spectra(cameras: dict[str, Calibration]) -> dict:
 MODELS = ("ridge", "sparse", "nnls", "mlp")
 
 
+@torch.no_grad()
+def levelling(camera: Calibration) -> dict:
+    """Return errors of the network that ships, natural spectra, with and without levelling."""
+    x = PRIORS["natural"](3000, camera.wavelength, generator=torch.Generator().manual_seed(2))
+    network, plain = load_model("mlp", camera), load_model("mlp", camera)
+    plain.levelled = lambda y, angle: y
+    found: dict = {}
+    for snr in SNRS:
+        for place, angle in (("centre", 0.0), ("corner", float(camera.angle[-1]))):
+            y = camera.project(x, torch.full((len(x),), angle))
+            y = add_noise(y, snr, torch.Generator().manual_seed(3))
+            found[f"{snr:g} dB, {place}"] = {
+                name: float((model(y, angle) - x).square().mean())
+                for name, model in (("without", plain), ("with", network))
+            }
+    return found
+
+
 # --- whole frames -----------------------------------------------------------------------------
 
-BLUR = ("diffraction", "chromatic_focus", "field_curvature")
 VARIANTS = {
     "all effects": {},
-    "no blur": dict.fromkeys(BLUR, False),
-    "no angle": {"field_angle": False},
-    "no blur, no angle": dict.fromkeys([*BLUR, "field_angle"], False),
+    "no blur": dict.fromkeys(("diffraction", "chromatic_focus", "field_curvature"), False),
 }
+TILE, BORDER = 25, 6  # px
 
 
 def frames(camera: squilla.Camera, learnt: Calibration) -> dict:
-    """Return errors in the corners and in the middle of a scene with the same tiles everywhere."""
+    """Return errors in the corners and in the middle of a frame, away from the borders of tiles."""
     scene = tiles(camera)
+    assert learnt.lattice is not None
     angle = learnt.lattice.field_angle()
-    places = {"centre": angle < np.radians(3.3), "corner": angle > np.radians(8.0)}
+    inner = np.arange(learnt.lattice.field[0]) % TILE
+    inner = (inner >= BORDER) & (inner < TILE - BORDER)
+    inside = inner[:, None] & inner
+    places = {
+        "centre": inside & (angle < np.radians(3.3)),
+        "corner": inside & (angle > np.radians(7.0)),
+    }
     found: dict = {}
     for name, off in VARIANTS.items():
         design = camera.design.model_copy(update={"effects": Effects(**off)})
@@ -207,10 +231,11 @@ def frames(camera: squilla.Camera, learnt: Calibration) -> dict:
 
 
 def tiles(camera: squilla.Camera):
-    """Return a scene of 12 px tiles of natural spectra, the same in the middle and the corners."""
-    wavelength, size = camera.design.wavelength, camera.design.field.size + 52
+    """Return a scene of 5 x 5 tiles of natural spectra, which the field shows whole."""
+    wavelength, size = camera.design.wavelength, camera.design.field.size
+    assert size == 5 * TILE
     pick = PRIORS["natural"](25, wavelength, generator=torch.Generator().manual_seed(8)).numpy()
-    number = np.arange(size) // 12 % 5
+    number = np.arange(size) // TILE
     return labelled(pick[5 * number[:, None] + number], wavelength)
 
 
@@ -225,13 +250,21 @@ def ratios(row: dict) -> list[float]:
 def table(results: dict) -> str:
     lines = [f"effective index {results['effective_index']}", ""]
     lines += ["| corner / centre | " + " | ".join(HOW) + " |", "|---" * 5 + "|"]
-    for part in ("linear", "spectra", "frames"):
-        for name, row in results.get(part, {}).items():
-            if part == "linear":
-                row = {how: dict(zip(("centre", "corner"), row[how], strict=True)) for how in HOW}
-            lines.append(
-                f"| {part}: {name} | " + " | ".join(f"{r:.2f}" for r in ratios(row)) + " |"
-            )
+    for name, row in results["linear"].items():
+        cells = " | ".join(f"{row[how][1] / row[how][0]:.2f}" for how in HOW)
+        lines.append(f"| linear, closed form: {name} | {cells} |")
+    for name, row in results["spectra"].items():
+        cells = " | ".join(f"{ratio:.2f}" for ratio in ratios(row))
+        lines.append(f"| spectra: {name} | {cells} |")
+    lines += ["", "| mlp | without levelling | with |", "|---|---|---|"]
+    for name, row in results["levelling"].items():
+        lines.append(f"| {name} | {row['without']:.5f} | {row['with']:.5f} |")
+    lines += ["", "| frames, corner: error / that with the true R | " + " | ".join(HOW[:3]) + " |"]
+    lines += ["|---" * 4 + "|"]
+    for name, row in results.get("frames", {}).items():
+        true = row["true"]["corner"]
+        cells = " | ".join(f"{row[how]['corner'] / true:.2f}" for how in HOW[:3])
+        lines.append(f"| {name} (true R: {true:.5f}) | {cells} |")
     return "\n".join(lines)
 
 
@@ -259,11 +292,12 @@ def picture(cameras: dict[str, Calibration], results: dict):
         heights = [
             ratios(results["spectra"][f"natural, ridge, {snr:g} dB"])[number] for snr in SNRS
         ]
-        bars = right.bar(
-            np.arange(3) + 0.2 * (number - 1.5), heights, 0.18, color=COLOURS[number], label=how
-        )
-        right.bar_label(bars, fmt="%.2f", fontsize=6)
+        place = np.arange(3) + 0.2 * (number - 1.5)
+        excess = np.array(heights) - 1
+        bars = right.bar(place, excess, 0.18, bottom=1, color=COLOURS[number], label=how)
+        right.bar_label(bars, [f"{height:.2f}" for height in heights], padding=2, fontsize=6)
     right.axhline(1, color=INK, lw=0.8)
+    right.set_ylim(0.98, 1.45)
     right.set_xticks(range(3), [f"{snr:g} dB" for snr in SNRS])
     right.set_title("error in the corner / error in the centre", loc="left")
     right.legend(frameon=False, loc="upper left", title="sensitivity")

@@ -160,7 +160,7 @@ def test_solvers_explain_the_measurement(solver, spectra):
 
 
 def test_networks_see_what_the_mean_sensitivity_would_measure():
-    """At the ends of the field, with 36 filters, hardly more than half of the change is left."""
+    """At the ends of the field hardly more than half of the tilt's change is left."""
     camera = smooth_camera(0, filters=36, bands=48, angles=3)
     spectra = broad_spectra(200, camera.wavelength, generator=torch.Generator().manual_seed(3))
     network, mean = untrained("mlp", camera), camera.project(spectra)

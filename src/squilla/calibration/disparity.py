@@ -244,9 +244,9 @@ def _common(values: np.ndarray, seen: np.ndarray, rank: int) -> tuple:
         for part in (0, 1):
             whole[:, part][missing] = (share[:, None] * mean[part])[missing]
     halves = [values[:, start : start + points // 2] for start in (0, points)]
-    upper = sum(half @ half.T for half in halves).astype(float)
+    upper = np.sum([half @ half.T for half in halves], 0, float)
     halves = [values[:, start + points // 2 : start + points] for start in (0, points)]
-    lower = sum(half @ half.T for half in halves).astype(float)
+    lower = np.sum([half @ half.T for half in halves], 0, float)
     strength, vectors = np.linalg.eigh(upper + lower)
     alone = np.diag(upper + lower) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
     spread = np.sqrt(np.maximum(alone / values.shape[1], 1e-5))

@@ -71,10 +71,9 @@ def align_stack(
     )  # fmt: skip
     bad = ~np.isfinite(images)
     values = np.where(bad, 0, images).astype(np.float32)
-    if largest is None:
-        largest = min(field) / 3 / float(np.abs(baseline).max())
+    reach = min(field) / 3 / float(np.abs(baseline).max()) if largest is None else largest
     edges = find_edges(values, bad)
-    found = find_plane(edges, lattice, 0 * baseline, (-largest, largest), free=loose)
+    found = find_plane(edges, lattice, 0 * baseline, (-reach, reach), free=loose)
     if found.score < 0.1:
         raise InputError(
             f"The sub-images agree by {found.score:.2f} only: is the array {rows} x {columns}, row "
