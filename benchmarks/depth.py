@@ -365,14 +365,14 @@ def figure(take: Take, path: Path) -> None:
         sheets = sheet(2, 4, 1.0, WIDTH, colour_bar=True)
         axes = sheets.axes
         inner = slice(take.margin, -take.margin)
-        for place, unit in enumerate((0, 5)):
+        for spot, unit in enumerate((0, 5)):
             picture = views.image[unit, inner, inner].numpy()
-            draw_picture(axes[4 * place], picture, f"sub-image {unit}, as recorded", vmin=0)
+            draw_picture(axes[4 * spot], picture, f"sub-image {unit}, as recorded", vmin=0)
         part = (slice(60, 140), slice(120, 225))
-        for place, (name, each) in enumerate({"one shift": one, "every point": every}.items()):
+        for spot, (name, each) in enumerate({"one shift": one, "every point": every}.items()):
             colours = false_colour(each.y.numpy())
-            draw_picture(axes[1 + place], colours, f"{name}: units 0, 5, 30")
-            draw_picture(axes[5 + place], colours[part], "its edges")
+            draw_picture(axes[1 + spot], colours, f"{name}: units 0, 5, 30")
+            draw_picture(axes[5 + spot], colours[part], "its edges")
         limits = {"vmin": take.depth.min() - 2, "vmax": take.depth.max() + 2, "cmap": "viridis_r"}
         draw_picture(axes[3], take.depth, "true distance", **limits)
         colours = matplotlib.colormaps["viridis_r"].with_extremes(bad="#d9dce0")
