@@ -6,7 +6,7 @@ Every design that ships, and a mosaic that spends as many pixels as sixteen sub-
 colour chart, a real scene and slanted edges with the same F-number, the same sensor noise and the
 same total exposure time; the same Wiener estimator reconstructs them all. What a camera is like is
 written to experiments/results/cameras when it is finished, and such cameras are left out the next
-time; then the table is printed and docs/images/cameras.png drawn. Half a minute a camera on one
+time; then the table is printed and docs/images/cameras.webp drawn. Half a minute a camera on one
 core, four for the large mosaic.
 """
 
@@ -37,7 +37,7 @@ from squilla.reconstruction.reconstructor import load_model
 from squilla.spectra import CHART_LIGHT, chart_reflectances, gaussian_mixtures, lights, rgb
 
 RESULTS = Path(__file__).parent / "results" / "cameras"
-FIGURE = Path(__file__).parent.parent / "docs" / "images" / "cameras.png"
+FIGURE = Path(__file__).parent.parent / "docs" / "images" / "cameras.webp"
 
 LIGHT = (30, 100, 300, 1000, 3000, 10000)
 """Electrons that a pixel without a filter would collect of a white surface in the total time."""
@@ -45,7 +45,7 @@ LIGHT = (30, 100, 300, 1000, 3000, 10000)
 STEP = 2.0  # nm
 SIZE = 250  # points of the field, each way
 DISTANCE = 300.0  # mm
-FINE = "mosaic-16, 16 px a point"
+FINE = "mosaic-16-fine"  # sixteen pixels a point
 RED, GREEN = 14, 13  # patches of the chart
 CROP = (slice(86, 134), slice(2, 84))  # two patches and the frame around
 MOTION = 4  # px, of the moving chart during the total time
@@ -371,7 +371,7 @@ def draw(results: dict) -> None:
 
     @styled
     def figure():
-        sheet = canvas(7.2, 5.6)
+        sheet = canvas(7.2, 5.2)
         upper, lower = sheet.subfigures(2, 1, height_ratios=(3, 2.4))
         left, right = upper.subplots(1, 2)
         names = [name for name in ORDER if name in results]
@@ -402,7 +402,7 @@ def draw(results: dict) -> None:
         return sheet
 
     FIGURE.parent.mkdir(exist_ok=True)
-    figure().savefig(FIGURE, dpi=150)
+    figure().savefig(FIGURE, dpi=150, pil_kwargs={"quality": 88})
 
 
 def main() -> None:

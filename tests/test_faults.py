@@ -42,7 +42,7 @@ def plain(design, size, value=1.0) -> DataArray:
     ("distance", "percent"), [(0.0, (20.8, 20.8, 20.8)), (500.0, (0.0, 7.0, 13.5))]
 )
 def test_leak_at_the_centre_the_edge_and_the_corner(distance, percent):
-    """A pupil of 500 um over a filter of 400 um; published for this geometry."""
+    """A pupil of 500 um over a filter of 400 um; the figures are those of a ray trace."""
     tree = CameraDesign.load("thesis").model_dump()
     tree["filters"] |= filters(distance=distance)
     y, x = np.array([0.0, 125.0, 125.0]), np.array([0.0, 0.0, 125.0])
@@ -135,7 +135,7 @@ def test_calibration_finds_the_leaking_response():
 
 
 def test_lateral_colour_of_a_displaced_pupil():
-    """0.54 px for 0.1 mm at 500 nm, published for N-BK7, whose dispersion is close."""
+    """0.54 px for 0.1 mm at 500 nm in a ray trace of N-BK7, whose dispersion is close."""
     tree = CameraDesign.load("thesis").model_dump()
     tree["lens"] |= {
         "diameter": 690.0,
@@ -202,7 +202,7 @@ def test_the_lattice_takes_in_each_filter_s_lateral_colour():
 
 
 def test_ghosts_of_a_bright_hemisphere_are_ten_times_the_signal():
-    """The sum of cos^4 over all neighbours, published as 10 for the thesis' array."""
+    """The sum of cos^4 over all neighbours of a lens, on the mean of the thesis' array."""
     design = CameraDesign.load("thesis").model_copy(update={"stop": None})
     apart = design.centres[:, None] - design.centres[None]
     ghost = (1 + (apart**2).sum(-1) / design.focal**2) ** -2.0

@@ -79,8 +79,9 @@ class Lattice:
 class Pixels:
     """What dark and flat frames say of every pixel of the sensor.
 
-    bias : (rows, columns) DN without light at no exposure, float32.
-    dark_rate : (rows, columns) DN per ms that the dark current adds, float32.
+    bias : (rows, columns) DN without light at no exposure, float32; the median where no lens
+        lights the sensor.
+    dark_rate : (rows, columns) DN per ms that the dark current adds, float32; likewise.
     flat : (rows, columns) relative response, float32; 1 at the response that `sensitivity` states.
     valid : (rows, columns) bool; False for dead, hot and unlit pixels.
     saturation : DN at and above which a pixel is not believed.

@@ -59,12 +59,12 @@ def stray_light(
 def _levels(frame, bias, dark_rate, exposure, blocks, level):
     for number in numba.prange(len(blocks)):
         y, x = blocks[number]
-        total, highest = np.float32(0), np.float32(-1e9)
+        total, highest = np.float32(0), np.float32(0)
         for row in range(y, y + _BLOCK):
             for column in range(x, x + _BLOCK):
-                light = np.float32(frame[row, column]) - bias[row, column]
-                light -= exposure * dark_rate[row, column]
-                total += light
-                highest = max(highest, light)
-        # Without the brightest pixel, which may be a hot one.
-        level[number] = (total - highest) / (_BLOCK * _BLOCK - 1)
+                value = np.float32(frame[row, column])
+                total += value
+                highest = max(highest, value)
+        # Without the brightest pixel, which may be a hot one; dark parts have one dark level.
+        dark = bias[y, x] + exposure * dark_rate[y, x]
+        level[number] = (total - highest) / (_BLOCK * _BLOCK - 1) - dark
