@@ -360,8 +360,6 @@ def figure(take: Take, path: Path) -> None:
 
     @styled
     def draw():
-        import matplotlib
-
         sheets = sheet(2, 4, 1.0, WIDTH, colour_bar=True)
         axes = sheets.axes
         inner = slice(take.margin, -take.margin)
@@ -375,12 +373,11 @@ def figure(take: Take, path: Path) -> None:
             draw_picture(axes[5 + spot], colours[part], "its edges")
         limits = {"vmin": take.depth.min() - 2, "vmax": take.depth.max() + 2, "cmap": "viridis_r"}
         draw_picture(axes[3], take.depth, "true distance", **limits)
-        colours = matplotlib.colormaps["viridis_r"].with_extremes(bad="#d9dce0")
-        limits["cmap"] = colours
         assert every.depth is not None
         found = every.depth.distance.numpy()
-        picture = draw_picture(axes[7], found, "found", **limits)
-        draw_colour_bar(sheets, picture, "distance (mm)")
+        pale = np.where(every.depth.confident.numpy(), 1.0, 0.35)
+        draw_picture(axes[7], found, "found; pale: filled in", alpha=pale, **limits)
+        draw_colour_bar(sheets, axes[3].images[0], "distance (mm)")
         return sheets
 
     draw().savefig(path, dpi=150, bbox_inches="tight", pad_inches=0.04)
