@@ -10,6 +10,9 @@ from squilla.calibration.edges import find_edges
 from squilla.calibration.quality import colour_error, misalignment
 from squilla.errors import InputError
 
+_ALIKE = 0.4
+"""Mean correlation of the views' gradients that noise does not reach when single views are free."""
+
 
 def align_stack(
     images: np.ndarray,
@@ -75,7 +78,7 @@ def align_stack(
         largest = min(field) / 3 / float(np.abs(baseline).max())
     edges = find_edges(values, bad)
     found = find_plane(edges, lattice, 0 * baseline, (-largest, largest), free=loose)
-    if found.score < 0.1:
+    if found.score < _ALIKE:
         raise InputError(
             f"The sub-images agree by {found.score:.2f} only: is the array {rows} x {columns}, row "
             "by row, and does each show the same scene?"
