@@ -121,8 +121,9 @@ def measure(
         disparity = np.full(lattice.field, lattice.disparity(distance), np.float32)
         quality = {"alignment": "from the given distance", "alignment_score": 1.0}
     else:
+        even = evened(views, lattice, calibration)
         plane, offset, quality = place(
-            views, lattice, largest, noise=noise, start=before, refine=refine
+            even, lattice, largest, noise=noise, start=before, refine=refine
         )
         if before is not None and np.abs(plane - before).sum() > _DRIFT:
             return measure(raw, calibration, nearest=nearest, refine=refine)  # another scene
@@ -336,6 +337,46 @@ def _fitting(raw: Raw, calibration: Calibration) -> tuple[Lattice, Pixels]:
 
 
 # --- placing ----------------------------------------------------------------------------------
+
+
+def evened(views: SubImages, lattice: Lattice, calibration: Calibration) -> SubImages:
+    """Return sub-images without the shading that each filter gives the scene's mean spectrum.
+
+    Towards the edge of the field lenses get less light, and filters pass other wavelengths. That
+    shading stays with the unit when the scene moves, and would hold it where it is. Only for
+    finding places: single points have other spectra, and keep their field angle instead.
+    """
+    if len(calibration.angle) < 2:
+        return views
+    response = calibration.mean_sensitivity.double().numpy()
+    gram = response @ response.T
+    gram += 1e-3 * np.trace(gram) / len(gram) * np.eye(len(gram))
+    level = _inner(views.image, views.margin).mean((1, 2)).double().numpy()
+    spectrum = response.T @ np.linalg.solve(gram, level)
+    light = np.maximum(calibration.sensitivity @ spectrum, 1e-30)  # (A, M)
+    share = np.clip(light / light[0], 0.5, 2)
+    square = np.tan(calibration.angle) ** 2 / np.tan(calibration.angle[-1]) ** 2
+    powers = np.stack([square - square[0], square**2 - square[0] ** 2], -1)
+    fit = np.linalg.lstsq(powers, share - 1, rcond=None)[0].T
+    image = np.empty_like(views.image.numpy())
+    middle = views.margin + views.offset + (np.array(lattice.field) - 1) / 2
+    reach = lattice.focal * np.tan(calibration.angle[-1])
+    _even(views.image.numpy(), middle, reach, fit.astype(np.float32), image)
+    return replace(views, image=torch.from_numpy(image))
+
+
+@numba.njit(parallel=True, cache=True, fastmath=True)
+def _even(image, middle, reach, fit, even):
+    units, rows, columns = image.shape
+    for line in numba.prange(units * rows):
+        unit, row = line // rows, line % rows
+        y = np.float32((row - middle[unit, 0]) / reach)
+        left, step = np.float32(-middle[unit, 1] / reach), np.float32(1 / reach)
+        for column in range(columns):
+            x = left + column * step
+            t = min(y * y + x * x, np.float32(1))
+            share = 1 + t * (fit[unit, 0] + t * fit[unit, 1])
+            even[unit, row, column] = image[unit, row, column] / share
 
 
 def place(

@@ -62,10 +62,6 @@ def find_edges(
 ) -> Edges:
     """Return the gradients of pictures along x and y.
 
-    What grows from the middle of a window outwards is taken from its gradients. So filters shade
-    their sub-images, for they pass less or more at larger field angles; it stays with the unit when
-    the scene moves, and would hold it where it is.
-
     Parameters
     ----------
     images : array, (M, H, W) float32
@@ -89,7 +85,7 @@ def find_edges(
     smooth = choice[0] if noise is None else _enough(images, bad, noise, choice)
     step = max(min(step, smooth), smooth // 2)
     values, wrong = _gradients(images, bad, smooth, step)
-    _remove_shading(values, wrong)
+    _scale(values, wrong)
     return Edges(values, wrong, step, smooth)
 
 
@@ -173,28 +169,16 @@ def _gradient(images, bad, step, bell, slope, values, wrong):
 
 
 @numba.njit(parallel=True, cache=True, fastmath=True)
-def _remove_shading(values, wrong):
-    """Take the outward gradient from every unit's, and scale what is left to unit mean square."""
+def _scale(values, wrong):
+    """Scale every unit to unit mean square over its good points."""
     _, units, rows, columns = values.shape
     for unit in numba.prange(units):
-        product, power = 0.0, 1e-9
+        energy, count = 0.0, 1e-9
         for row in range(rows):
-            y = np.float32(row - (rows - 1) / 2)
             across, down, flags = values[0, unit, row], values[1, unit, row], wrong[unit, row]
             for column in range(columns):
-                x, good = np.float32(column - (columns - 1) / 2), np.float32(not flags[column])
-                product += x * across[column] + y * down[column]
-                power += good * (x * x + y * y)
-        share, energy, count = np.float32(product / power), 0.0, 1e-9
-        for row in range(rows):
-            y = np.float32(row - (rows - 1) / 2)
-            across, down, flags = values[0, unit, row], values[1, unit, row], wrong[unit, row]
-            for column in range(columns):
-                x, good = np.float32(column - (columns - 1) / 2), np.float32(not flags[column])
-                across[column] -= share * x * good
-                down[column] -= share * y * good
                 energy += across[column] ** 2 + down[column] ** 2
-                count += good
+                count += not flags[column]
         values[:, unit] *= np.float32(1 / np.sqrt(energy / count + 1e-30))
 
 

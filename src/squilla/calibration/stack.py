@@ -10,6 +10,9 @@ from squilla.calibration.edges import find_edges
 from squilla.calibration.quality import colour_error, misalignment
 from squilla.errors import InputError
 
+_ALIKE = 0.4
+"""Mean correlation of the views' gradients that noise does not reach when single views are free."""
+
 
 def align_stack(
     images: np.ndarray,
@@ -74,7 +77,7 @@ def align_stack(
     reach = min(field) / 3 / float(np.abs(baseline).max()) if largest is None else largest
     edges = find_edges(values, bad)
     found = find_plane(edges, lattice, 0 * baseline, (-reach, reach), free=loose)
-    if found.score < 0.1:
+    if found.score < _ALIKE:
         raise InputError(
             f"The sub-images agree by {found.score:.2f} only: is the array {rows} x {columns}, row "
             "by row, and does each show the same scene?"
