@@ -44,7 +44,6 @@ _CLEAR = 0.055
 _SURE = 0.1
 """Expected standard deviation of the disparity, px per pitch, up to which a point is believed."""
 
-
 _LIMIT = 0.03
 """Deviation that is left without noise, px per pitch, as benchmarks/depth.py finds it."""
 
