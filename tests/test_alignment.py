@@ -226,6 +226,18 @@ def test_a_misplaced_channel_costs_the_stated_colour(shift):
     assert stated == pytest.approx(true, rel=0.2)
 
 
+def test_noise_alone_costs_no_colour():
+    """Beside the true slopes those of resampled noise do not count."""
+    lattice = array()
+    random = np.random.default_rng(0)
+    views = capture(lattice, (0.0, 0.0, 0.0))
+    noise = torch.from_numpy(random.standard_normal(views.image.shape).astype(np.float32))
+    offset = random.uniform(-0.5, 0.5, (16, 2))
+    y, _ = align(replace(views, image=10 + noise, offset=offset), lattice, 0.0)
+    alone = colour_error(y, np.zeros(16), 1.0)
+    assert colour_error(y, np.ones(16), 1.0) < 0.25 * alone
+
+
 # --- the lattice from shots -------------------------------------------------------------------
 
 
