@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from conftest import small_design
 from squilla import align_stack
-from squilla.calibration.alignment import SubImages, align, place
+from squilla.calibration.alignment import align, place
 from squilla.calibration.bundle import lattice_from_shots
 from squilla.calibration.calibration import Lattice
 from squilla.calibration.disparity import find_plane, fit_plane, plane_map
@@ -19,6 +19,7 @@ from squilla.calibration.geometry import find_windows
 from squilla.calibration.quality import colour_error, drift, misalignment
 from squilla.calibration.resample import monomials
 from squilla.calibration.stack import agreement
+from squilla.calibration.views import SubImages
 from squilla.camera.twin import Camera
 from squilla.cli.app import app
 from squilla.errors import InputError

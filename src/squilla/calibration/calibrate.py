@@ -5,12 +5,12 @@ from collections.abc import Iterable
 import numpy as np
 
 from squilla import __version__
-from squilla.calibration.alignment import windows
 from squilla.calibration.bundle import lattice_from_shots
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.geometry import lattice_from_flat, refine_with_target
 from squilla.calibration.pixels import Darks, Stack, defective, noise_of
 from squilla.calibration.sensitivity import SweepStep, Zones, sweep_responses, unfold
+from squilla.calibration.views import windows
 from squilla.camera.design import CameraDesign
 from squilla.errors import InputError
 from squilla.files.raw import Raw
