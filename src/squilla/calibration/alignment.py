@@ -122,7 +122,7 @@ def measure(
         quality["colour_error"] = colour_error(y, noise, quality["misalignment"])
         _warn(quality)
     snr_of_point = _pointwise_snr(y, pixels)
-    y = y / (raw.exposure or 1.0)
+    y /= raw.exposure or 1.0
     return Measurement(
         y,
         valid,
@@ -153,7 +153,8 @@ def _noise_variance(views: SubImages, pixels: Pixels) -> np.ndarray:
 def _pointwise_snr(y: Tensor, pixels: Pixels) -> Tensor:
     """Return the signal-to-noise ratio of aligned points, (H, W, M) DN -> (H, W) dB."""
     noise = y.mean(-1).clamp_min(0) / pixels.gain + (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
-    power = (y.square().mean(-1) - noise).clamp_min(0.1 * noise)
+    whole = torch.linalg.vector_norm(y, dim=-1).square() / y.shape[-1]
+    power = (whole - noise).clamp_min(0.1 * noise)
     return 10 * torch.log10(power / noise)
 
 
@@ -164,7 +165,8 @@ def _judge(views: SubImages, raw: Raw, pixels: Pixels) -> float:
             f"{100 * views.saturated:.0f} % of the frame is saturated; expose shorter or dim the "
             "light."
         )
-    good = inner(views.image, views.margin)[~inner(views.bad, views.margin)]
+    few = (slice(None), slice(None, None, 2), slice(None, None, 2))  # of a million, enough
+    good = inner(views.image, views.margin)[few][~inner(views.bad, views.margin)[few]]
     noise = float(_noise_variance(views, pixels).mean())
     if len(good) and float(good.mean()) < -max(2.0, np.sqrt(noise)):
         raise InputError(
