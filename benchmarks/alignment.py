@@ -25,11 +25,12 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from squilla.calibration.alignment import align, measure, sub_images
+from squilla.calibration.alignment import align, measure
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.disparity import find_plane, plane_map
 from squilla.calibration.edges import find_edges
 from squilla.calibration.rehearsal import poster
+from squilla.calibration.views import sub_images
 from squilla.camera.design import CameraDesign
 from squilla.camera.scenes import load_scene
 from squilla.camera.twin import Camera

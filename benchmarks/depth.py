@@ -28,9 +28,10 @@ from scipy import ndimage
 
 import squilla
 from squilla.calibration import depth as dense
-from squilla.calibration.alignment import SubImages, align, measure, place, sub_images, windows
+from squilla.calibration.alignment import align, measure, place
 from squilla.calibration.calibration import Calibration
 from squilla.calibration.rehearsal import Rehearsal
+from squilla.calibration.views import SubImages, sub_images, windows
 from squilla.camera.scenes import load_scene
 from squilla.camera.solid import solid_scene
 from squilla.camera.twin import Camera

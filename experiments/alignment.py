@@ -19,9 +19,10 @@ import torch
 from PIL import Image
 
 import squilla
-from squilla.calibration.alignment import align, sub_images
+from squilla.calibration.alignment import align
 from squilla.calibration.disparity import plane_map
 from squilla.calibration.rehearsal import Rehearsal, poster
+from squilla.calibration.views import sub_images
 from squilla.camera.design import CameraDesign
 from squilla.camera.scenes import load_scene
 

@@ -22,10 +22,11 @@ import torch
 from torch import Tensor
 from xarray import DataArray
 
-from squilla.calibration.alignment import Measurement, align, sub_images
+from squilla.calibration.alignment import Measurement, align
 from squilla.calibration.calibration import Calibration
 from squilla.calibration.rehearsal import ideal_calibration
 from squilla.calibration.single_lens import measure_mosaic, measure_sequence
+from squilla.calibration.views import sub_images
 from squilla.camera.design import CameraDesign, designs
 from squilla.camera.scenes import chart_layout, load_scene
 from squilla.camera.twin import Camera

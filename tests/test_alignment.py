@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from conftest import small_design
 from squilla import align_stack
-from squilla.calibration.alignment import SubImages, align, place
+from squilla.calibration.alignment import align, place
 from squilla.calibration.bundle import lattice_from_shots
 from squilla.calibration.calibration import Lattice
 from squilla.calibration.disparity import find_plane, fit_plane, plane_map
@@ -19,6 +19,7 @@ from squilla.calibration.geometry import find_windows
 from squilla.calibration.quality import colour_error, drift, misalignment
 from squilla.calibration.resample import monomials
 from squilla.calibration.stack import agreement
+from squilla.calibration.views import SubImages
 from squilla.camera.twin import Camera
 from squilla.cli.app import app
 from squilla.errors import InputError
@@ -224,6 +225,18 @@ def test_a_misplaced_channel_costs_the_stated_colour(shift):
     true = np.linalg.norm(wrong - right) / np.linalg.norm(right)
     stated = colour_error(torch.from_numpy(right), np.zeros(4), shift)
     assert stated == pytest.approx(true, rel=0.2)
+
+
+def test_noise_alone_costs_no_colour():
+    """Beside the true slopes those of resampled noise do not count."""
+    lattice = array()
+    random = np.random.default_rng(0)
+    views = capture(lattice, (0.0, 0.0, 0.0))
+    noise = torch.from_numpy(random.standard_normal(views.image.shape).astype(np.float32))
+    offset = random.uniform(-0.5, 0.5, (16, 2))
+    y, _ = align(replace(views, image=10 + noise, offset=offset), lattice, 0.0)
+    alone = colour_error(y, np.zeros(16), 1.0)
+    assert colour_error(y, np.ones(16), 1.0) < 0.25 * alone
 
 
 # --- the lattice from shots -------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from conftest import small_design
-from squilla.calibration.alignment import align, measure, sub_images
+from squilla.calibration.alignment import align, measure
 from squilla.calibration.calibrate import calibrate
 from squilla.calibration.calibration import Calibration
 from squilla.calibration.geometry import find_windows
@@ -15,6 +15,7 @@ from squilla.calibration.pixels import Darks, Stack, noise_of
 from squilla.calibration.rehearsal import Rehearsal, poster
 from squilla.calibration.resample import SINC, sinc_kernel
 from squilla.calibration.store import load_calibration
+from squilla.calibration.views import sub_images
 from squilla.camera.design import CameraDesign, Effects
 from squilla.camera.lens import cone
 from squilla.camera.twin import Camera

@@ -9,10 +9,11 @@ import torch
 import xarray as xr
 
 from squilla.calibration import depth as room
-from squilla.calibration.alignment import SubImages, measure
+from squilla.calibration.alignment import measure
 from squilla.calibration.depth import Depth
 from squilla.calibration.rehearsal import poster
 from squilla.calibration.resample import monomials
+from squilla.calibration.views import SubImages
 from squilla.camera import warp
 from squilla.camera.solid import solid_scene
 from squilla.errors import InputError

@@ -50,6 +50,7 @@ def frames(camera, scene) -> list[Raw]:
 @pytest.fixture
 def live(frames, calibration) -> Iterator[LiveSource]:
     source = LiveSource(Stack(frames), calibration, load_model("ridge", calibration))
+    source._first.wait(60)  # compiles what measures
     yield source
     source.close()
 
@@ -205,6 +206,20 @@ def test_frames_wait_for_the_page(live):
             seen.append(number)
             line.socket.send(json.dumps({"ask": "acknowledge", "frame": number}))
         assert seen[0] < seen[1] < seen[2]
+        line.socket.close()
+
+
+def test_the_last_of_many_wishes_is_answered(live):
+    """A page that changes its mind in the middle of answers gets what it asked for last."""
+    with running(live) as address:
+        line = Line(address)
+        number = 0
+        for number in range(1, 200):
+            wanted = [{"kind": "band", "band": 3, "id": number}] * 4
+            line.socket.send(json.dumps({"ask": "watch", "wanted": wanted}))
+            time.sleep(0.0002 * (number % 16))
+        while line.receive()[0].get("id") != number:
+            pass
         line.socket.close()
 
 

@@ -17,11 +17,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from xarray import DataArray
 
 from squilla import __version__
-from squilla.calibration.alignment import Measurement, align, measure, sub_images
+from squilla.calibration.alignment import Measurement, align, measure
 from squilla.calibration.calibrate import calibrate
 from squilla.calibration.calibration import Calibration
 from squilla.calibration.rehearsal import Rehearsal
 from squilla.calibration.store import load_calibration
+from squilla.calibration.views import sub_images
 from squilla.camera.scenes import SCENES, chart_layout, load_scene
 from squilla.camera.solid import solid_scene
 from squilla.camera.twin import Camera, Truth

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from squilla.calibration.alignment import windows
 from squilla.calibration.calibration import Lattice
 from squilla.calibration.disparity import compare, find_plane, plane_map
 from squilla.calibration.edges import find_edges
+from squilla.calibration.views import windows
 from squilla.errors import InputError
 
 _LOOSE = 3.0

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from squilla import __version__
-from squilla.calibration.alignment import windows
 from squilla.calibration.bundle import lattice_from_shots
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.geometry import lattice_from_flat, refine_with_target
@@ -20,6 +19,7 @@ from squilla.calibration.sensitivity import (
     sweep_sensitivity,
 )
 from squilla.calibration.stray import stray_light
+from squilla.calibration.views import windows
 from squilla.camera.design import CameraDesign
 from squilla.camera.lens import cone
 from squilla.errors import InputError

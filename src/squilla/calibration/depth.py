@@ -21,7 +21,7 @@ from squilla.calibration.resample import CUBIC, SINC, resample
 if TYPE_CHECKING:
     from xarray import DataArray
 
-    from squilla.calibration.alignment import SubImages
+    from squilla.calibration.views import SubImages
 
 _STEP = 0.45
 """Shift of the farthest unit from one plane to the next, px: well within the width of an edge."""

@@ -234,19 +234,20 @@ def _common(values: np.ndarray, seen: np.ndarray, rank: int) -> tuple:
     score : float
     """
     points = values.shape[1] // 2
-    gaps = not seen.all()
-    if gaps:
-        whole = values.reshape(len(values), 2, points)
-        whole *= seen[:, None]
-        mean = whole.sum(0) / (seen.sum(0) + 1e-9)
-        share = np.einsum("mcp,cp->m", whole, mean) / (seen @ np.square(mean).sum(0) + 1e-9)
-        missing = ~seen
-        for part in (0, 1):
-            whole[:, part][missing] = (share[:, None] * mean[part])[missing]
-    halves = [values[:, start : start + points // 2] for start in (0, points)]
-    upper = np.sum([half @ half.T for half in halves], 0, float)
-    halves = [values[:, start + points // 2 : start + points] for start in (0, points)]
-    lower = np.sum([half @ half.T for half in halves], 0, float)
+    if not seen.all():
+        parts = values.reshape(len(values), 2, points)
+        parts *= seen[:, None]
+        mean = parts.sum(0) / (seen.sum(0) + 1e-9)
+        share = np.einsum("mcp,cp->m", parts, mean) / (seen @ np.square(mean).sum(0) + 1e-9)
+        parts += np.where(seen[:, None], 0, share[:, None, None] * mean).astype(np.float32)
+    middle = points // 2
+
+    def products(start: int, stop: int) -> np.ndarray:
+        """Return the units' inner products over some points, (M, M)."""
+        real, imaginary = values[:, start:stop], values[:, points + start : points + stop]
+        return (real @ real.T + imaginary @ imaginary.T).astype(float)
+
+    upper, lower = products(0, middle), products(middle, points)
     strength, vectors = np.linalg.eigh(upper + lower)
     alone = np.diag(upper + lower) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
     spread = np.sqrt(np.maximum(alone / values.shape[1], 1e-5))

@@ -143,24 +143,29 @@ def _gradient(images, bad, step, bell, slope, values, wrong):
                 smooth[column] += a * source[column]
                 steep[column] += b * source[column]
                 spoilt[column] += flags[column]
+        # Every step-th sample together, so that the compiler makes vector loops of what follows.
+        length = columns // step
+        parts = np.empty((2, step, length), np.float32)
+        flags = np.empty((step, length), np.uint8)
+        for phase in range(step):
+            for n in range(length):
+                parts[0, phase, n] = smooth[n * step + phase]
+                parts[1, phase, n] = steep[n * step + phase]
+                flags[phase, n] = spoilt[n * step + phase]
         first = -(-reach // step)
-        count = (columns - reach - 1) // step + 1 - first
+        count = (step * length - reach - 1) // step + 1 - first
         x, y = (
             values[0, unit, row, first : first + count],
             values[1, unit, row, first : first + count],
         )
         flawed = np.zeros(count, np.int32)
         for k in range(len(bell)):
-            at = first * step + k - reach
-            # Samples in order, so that the compiler makes vector loops of what follows.
-            a, b, c = (
-                smooth[at::step][:count].copy(),
-                steep[at::step][:count].copy(),
-                spoilt[at::step],
-            )
+            at, phase = (first * step + k - reach) // step, (first * step + k - reach) % step
+            a, b = parts[0, phase, at : at + count], parts[1, phase, at : at + count]
+            c, along, beside = flags[phase, at : at + count], slope[k], bell[k]
             for n in range(count):
-                x[n] += slope[k] * a[n]
-                y[n] += bell[k] * b[n]
+                x[n] += along * a[n]
+                y[n] += beside * b[n]
                 flawed[n] += c[n]
         for n in range(count):
             good = flawed[n] <= 4  # single pixels, filled; more are an area with its own edges

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from squilla.calibration.alignment import windows
 from squilla.calibration.calibration import Lattice
 from squilla.calibration.disparity import find_plane
 from squilla.calibration.edges import find_edges
+from squilla.calibration.views import windows
 from squilla.camera.design import CameraDesign
 from squilla.errors import InputError
 

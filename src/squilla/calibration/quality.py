@@ -5,6 +5,7 @@ from torch import Tensor
 
 from squilla.calibration.calibration import Lattice
 from squilla.calibration.disparity import Placement
+from squilla.calibration.resample import sinc_kernel
 
 STALE = 0.1
 """Shifts of units across their baselines from which on a lattice is taken to have moved, px."""
@@ -64,6 +65,14 @@ def colour_error(y: Tensor, noise: np.ndarray, shift: float) -> float:
     across = float(np.mean((few[:, 2:] - few[:, :-2]) ** 2)) / 4
     few = y[:, ::5].numpy()
     down = float(np.mean((few[2:] - few[:-2]) ** 2)) / 4
-    of_noise = float(np.mean(noise)) / 2
+    of_noise = float(np.mean(noise)) * _noise_in_slopes()
     slope = max(across - of_noise, 0) + max(down - of_noise, 0)
     return float(shift * np.sqrt(slope / max(float(y[::5].square().mean()), 1e-30)))
+
+
+def _noise_in_slopes() -> float:
+    """Return the noise of a central difference of resampled pictures over that of their pixels."""
+    kernel = sinc_kernel(np.linspace(0, 1, 65))  # at all shifts alike
+    same = np.mean(np.sum(kernel**2, 1))
+    two_apart = np.mean(np.sum(kernel[:, 2:] * kernel[:, :-2], 1))
+    return float(same * (same - two_apart) / 2)

@@ -175,25 +175,32 @@ def _read(image, top, left, along, across, start, stop, line):
     taps = len(along)
     here = line[start:stop]
     here[:] = 0
-    for k in range(taps):
-        source = image[top + k, left + start : left + stop + taps - 1]
-        weight = along[k, start:stop]
+    a, b = across[0, start:stop], across[1, start:stop]
+    c, d = across[2, start:stop], across[3, start:stop]
+    for k in range(0, taps, 2):  # two rows at a time, for the weights across serve both
+        p, q = along[k, start:stop], along[k + 1, start:stop]
+        v = image[top + k, left + start : left + stop + taps - 1]
+        w = image[top + k + 1, left + start : left + stop + taps - 1]
         # Written out, for the compiler makes one vector loop of it.
-        a, b = across[0, start:stop], across[1, start:stop]
-        c, d = across[2, start:stop], across[3, start:stop]
         if taps == 4:
             for n in range(len(here)):
-                here[n] += weight[n] * (
-                    (a[n] * source[n] + b[n] * source[n + 1])
-                    + (c[n] * source[n + 2] + d[n] * source[n + 3])
+                here[n] += (
+                    a[n] * (p[n] * v[n] + q[n] * w[n])
+                    + b[n] * (p[n] * v[n + 1] + q[n] * w[n + 1])
+                    + c[n] * (p[n] * v[n + 2] + q[n] * w[n + 2])
+                    + d[n] * (p[n] * v[n + 3] + q[n] * w[n + 3])
                 )
             continue
         e, f = across[4, start:stop], across[5, start:stop]
         g, h = across[6, start:stop], across[7, start:stop]
         for n in range(len(here)):
-            here[n] += weight[n] * (
-                (a[n] * source[n] + b[n] * source[n + 1])
-                + (c[n] * source[n + 2] + d[n] * source[n + 3])
-                + (e[n] * source[n + 4] + f[n] * source[n + 5])
-                + (g[n] * source[n + 6] + h[n] * source[n + 7])
+            here[n] += (
+                a[n] * (p[n] * v[n] + q[n] * w[n])
+                + b[n] * (p[n] * v[n + 1] + q[n] * w[n + 1])
+                + c[n] * (p[n] * v[n + 2] + q[n] * w[n + 2])
+                + d[n] * (p[n] * v[n + 3] + q[n] * w[n + 3])
+                + e[n] * (p[n] * v[n + 4] + q[n] * w[n + 4])
+                + f[n] * (p[n] * v[n + 5] + q[n] * w[n + 5])
+                + g[n] * (p[n] * v[n + 6] + q[n] * w[n + 6])
+                + h[n] * (p[n] * v[n + 7] + q[n] * w[n + 7])
             )

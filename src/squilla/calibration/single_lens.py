@@ -6,8 +6,9 @@ import numpy as np
 import torch
 from scipy.ndimage import convolve1d
 
-from squilla.calibration.alignment import Measurement, pointwise_snr, sub_images
+from squilla.calibration.alignment import Measurement, pointwise_snr
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.views import sub_images
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 

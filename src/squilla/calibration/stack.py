@@ -3,11 +3,12 @@
 import numpy as np
 import torch
 
-from squilla.calibration.alignment import Measurement, SubImages, align
+from squilla.calibration.alignment import Measurement, align
 from squilla.calibration.calibration import Lattice
 from squilla.calibration.disparity import find_plane, plane_map
 from squilla.calibration.edges import find_edges
 from squilla.calibration.quality import colour_error, misalignment
+from squilla.calibration.views import SubImages
 from squilla.errors import InputError
 
 _ALIKE = 0.4
@@ -74,9 +75,9 @@ def align_stack(
     )  # fmt: skip
     bad = ~np.isfinite(images)
     values = np.where(bad, 0, images).astype(np.float32)
-    reach = min(field) / 3 / float(np.abs(baseline).max()) if largest is None else largest
+    widest = min(field) / 3 / float(np.abs(baseline).max()) if largest is None else largest
     edges = find_edges(values, bad)
-    found = find_plane(edges, lattice, 0 * baseline, (-reach, reach), free=loose)
+    found = find_plane(edges, lattice, 0 * baseline, (-widest, widest), free=loose)
     if found.score < _ALIKE:
         raise InputError(
             f"The sub-images agree by {found.score:.2f} only: is the array {rows} x {columns}, row "

@@ -245,9 +245,6 @@ class Client:
             return _asked(source.now(), message)
         except InputError as error:
             return protocol.pack({"id": message.id, "error": str(error)})
-        except Exception as error:  # a file that went away or rots; the others go on
-            reason = f"The file could not be read ({type(error).__name__}: {error})."
-            return protocol.pack({"id": message.id, "error": reason})
 
     def _source(self, number: int) -> Any:
         if number >= len(self._sources):
@@ -285,8 +282,9 @@ class Client:
 
     async def _send_packed(self, message: bytes) -> None:
         try:
-            async with self._sending:
-                await asyncio.wait_for(self._socket.send_bytes(message), _PATIENCE)
+            # Not wait_for: that of Python 3.11 may lose a cancellation, and a dropped watch go on.
+            async with self._sending, asyncio.timeout(_PATIENCE):
+                await self._socket.send_bytes(message)
         except TimeoutError:
             await self._socket.close(1008)
             raise
@@ -300,6 +298,9 @@ def _asked(view: View, ask: Picture | Spectra, more: dict[str, Any] | None = Non
         return protocol.pack(header | told, values)
     except InputError as error:
         return protocol.pack(header | {"error": str(error)})
+    except Exception as error:  # a file that went away or rots; other asks go on
+        reason = f"The file could not be read ({type(error).__name__}: {error})."
+        return protocol.pack(header | {"error": reason})
 
 
 def _id_of(text: str | None) -> int:
