@@ -31,6 +31,15 @@ def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+@pytest.mark.parametrize(
+    "ends", [(500, 750, 0), (500, 750, -1), (750, 500, 1), (500, np.inf, 1), (500, np.nan, 1),
+             (500, 750, 1e-12)]
+)  # fmt: skip
+def test_bands_that_make_no_grid(ends):
+    with pytest.raises(InputError, match="no grid"):
+        grid(*ends)
+
+
 def test_grid_has_both_ends():
     assert len(grid()) == 251
     assert grid()[[0, -1]].tolist() == [500, 750]

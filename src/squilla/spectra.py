@@ -22,8 +22,23 @@ CHART_LIGHT = "LED-B3"
 
 
 def grid(start: float = 500.0, stop: float = 750.0, step: float = 1.0) -> np.ndarray:
-    """Return an even wavelength grid with both ends, nm; the default is the thesis' 251 bands."""
-    return np.linspace(start, stop, round((stop - start) / step) + 1)
+    """Return an even wavelength grid with both ends, nm; the default is the thesis' 251 bands.
+
+    A step that does not divide the band gives way to the nearest that does.
+
+    Raises
+    ------
+    InputError
+        If the step is not positive, the band is reversed or infinite, or a million bands would
+        not fill it.
+    """
+    steps = (stop - start) / step if step > 0 else np.nan
+    if not 0 <= steps < 1e6:
+        raise InputError(
+            f"There is no grid from {start:g} to {stop:g} nm in steps of {step:g} nm; give a start "
+            "below the stop and a positive step."
+        )
+    return np.linspace(start, stop, round(steps) + 1)
 
 
 # --- measured tables ------------------------------------------------------------------------

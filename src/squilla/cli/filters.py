@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    import numpy as np
     from torch import Tensor
 
     from squilla.camera.design import CameraDesign
@@ -19,7 +20,7 @@ app = typer.Typer(
 )
 
 SnrOption = Annotated[
-    float | None, typer.Option(metavar="DB", help="Noise as strong in every filter.")
+    float | None, typer.Option(metavar="DB", help="Noise as strong in every filter; default: 20 dB.")
 ]
 ExposureOption = Annotated[
     float | None,
@@ -45,7 +46,10 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for machine
 def analyse(
     filters: Annotated[
         str,
-        typer.Argument(metavar="NAME|FILE", help='A camera, "thesis", or .toml .csv .npy .mat .nc'),
+        typer.Argument(
+            metavar="NAME|FILE",
+            help="A built-in camera, or an array: .toml .csv .txt .npy .npz .mat .nc",
+        ),
     ],
     seed: Annotated[
         int | None, typer.Option(help="Seed of a camera's random array; default: its own.")
@@ -65,7 +69,6 @@ def analyse(
     """
     from squilla.errors import InputError
     from squilla.optics import merit
-    from squilla.optics.tables import MeasuredFilters
     from squilla.spectra import grid
 
     own = None
@@ -73,13 +76,17 @@ def analyse(
         try:
             start, stop, step = map(float, wavelength.split(":"))
             own = grid(start, stop, step)
-        except (ValueError, ZeroDivisionError):
+        except ValueError:
             raise InputError(
                 f"--wavelength is {wavelength!r}; expected START:STOP:STEP such as 400:1000:1."
             ) from None
-    array = _filters(filters, seed, own)
-    band = array.wavelength if isinstance(array, MeasuredFilters) else grid()
+    array, band = _filters(filters, seed=seed, wavelength=own)
     response = array.transmittance(band)
+    if min(response.shape) < 2:
+        raise InputError(
+            f"{filters} holds {len(response)} filters at {len(band)} wavelengths; two of each are "
+            "the least that can be compared."
+        )
     values = merit.singular_values(response)
     every = max(1, round(10 * (len(band) - 1) / (band[-1] - band[0])))
     figures = {
@@ -174,7 +181,7 @@ def design(
             bar.update(tasks[stage], completed=done, error=best)
 
         found = optimise(
-            kinds[recipe](filters=paper.units),
+            kinds[recipe](filters=paper.channels),
             lambda response: expected_error(response * efficiency, known, noise=noise),
             band,
             draws=draws,
@@ -209,7 +216,7 @@ def design(
 @app.command()
 def tolerance(
     filters: Annotated[
-        str, typer.Argument(metavar="NAME|FILE", help='A camera, "thesis", or an array, .toml')
+        str, typer.Argument(metavar="NAME|FILE", help="A built-in camera, or an array, .toml")
     ],
     scale: Annotated[float, typer.Option(help="Of all thicknesses together, %.")] = 0.0,
     deposition: Annotated[float, typer.Option(help="Of each deposition, %.")] = 0.0,
@@ -246,7 +253,7 @@ def tolerance(
     from squilla.optics.tolerance import ProcessErrors
     from squilla.optics.tolerance import tolerance as coat
 
-    array = _filters(filters, None, None)
+    array, _ = _filters(filters)
     if not isinstance(array, FilterArray):
         raise InputError(f"{filters} is a table of responses; faults need the layers of a .toml.")
     known, noise, efficiency = _figure_of_merit(CameraDesign.load(camera), prior, snr, exposure)
@@ -295,18 +302,28 @@ def tolerance(
         typer.echo(f"{name:18s}{change:>20s}{factors[0]:>22s}{factors[1]:>22s}")
 
 
-def _filters(name: str, seed: int | None, wavelength) -> "FilterArray | MeasuredFilters":
-    """Return the filters of a built-in camera or of a file."""
+def _filters(
+    name: str, *, seed: int | None = None, wavelength: "np.ndarray | None" = None
+) -> "tuple[FilterArray | MeasuredFilters, np.ndarray]":
+    """Return the filters of a built-in camera or of a file, and the band to judge them in, nm."""
+    from squilla.camera.channels import filters_of
     from squilla.camera.design import CameraDesign
-    from squilla.optics.filters import StencilRecipe, read_filters
+    from squilla.errors import InputError
+    from squilla.optics.filters import FilterArray, read_filters
+    from squilla.spectra import grid
 
     if Path(name).suffix:
-        return read_filters(name, wavelength=wavelength)
+        if seed is not None:
+            raise InputError(f"--seed draws the filters of a camera; those of {name} are drawn.")
+        array = read_filters(name, wavelength=wavelength)
+        return array, grid() if isinstance(array, FilterArray) else array.wavelength
+    if wavelength is not None:
+        raise InputError(f"--wavelength is for a table of filters; the camera {name} knows its own.")
     camera = CameraDesign.load(name)
-    if camera.filters.table is not None:
-        return read_filters(camera.filters.table, wavelength=wavelength)
-    seed = camera.filters.seed if seed is None else seed
-    return StencilRecipe(filters=camera.units).draw(seed)
+    if seed is not None:
+        drawn = {"seed": seed}
+        camera = camera.model_copy(update={"filters": camera.filters.model_copy(update=drawn)})
+    return filters_of(camera), camera.wavelength
 
 
 def _figure_of_merit(
