@@ -1,3 +1,5 @@
+"""Figures of merit: Monte Carlo, closed forms and NumPy say the same."""
+
 import numpy as np
 import pytest
 import torch
@@ -177,6 +179,16 @@ def test_bad_input():
         Prior.draw("nature")
     with pytest.raises(InputError, match="exposure"):
         PhotonNoise(0.0)
+    for snr in (np.nan, np.inf, -4000.0):
+        with pytest.raises(InputError, match="SNR"):
+            WhiteNoise(snr)
+
+
+def test_noise_lost_in_rounding_is_said():
+    """Two equal filters leave no inverse but for the noise."""
+    twice = response(7, filters=3)[[0, 0]]
+    with pytest.raises(InputError, match="rounding"):
+        expected_error(twice, NATURAL, noise=WhiteNoise(300.0))
 
 
 # --- simpler figures ----------------------------------------------------------------------------

@@ -9,6 +9,7 @@ the mean over bands and spectra. It is in closed form, has a gradient, and takes
 as strong in every channel, or that of photons, of which a narrow filter passes few.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -86,6 +87,10 @@ class WhiteNoise:
 
     snr: float
 
+    def __post_init__(self):
+        if not -300 <= self.snr <= 300:  # beyond, its power is no number any more
+            raise InputError(f"The SNR must be a number of dB from -300 to 300, not {self.snr:g}.")
+
     def variance(self, sensitivity: Tensor, prior: Prior) -> Tensor:
         square = ((sensitivity @ prior.moment) * sensitivity).sum(-1)
         power = square.mean(-1, keepdim=True) * 10 ** (-self.snr / 10)
@@ -110,8 +115,11 @@ class PhotonNoise:
     clear: Tensor | float = field(default=1.0, repr=False)
 
     def __post_init__(self):
-        if not (self.exposure > 0 and self.read_noise >= 0):
-            raise InputError("The exposure must be above 0 e- and the read noise not below.")
+        if not (0 < self.exposure < math.inf and 0 <= self.read_noise < math.inf):
+            raise InputError(
+                f"An exposure of {self.exposure:g} e- with a read noise of {self.read_noise:g} e- "
+                "cannot be; give an exposure above 0 and a read noise of 0 or more."
+            )
 
     def variance(self, sensitivity: Tensor, prior: Prior) -> Tensor:
         per_electron = (self.clear * prior.mean).sum() / self.exposure
@@ -142,15 +150,13 @@ def expected_error(sensitivity: Tensor, prior: Prior, *, noise: Noise) -> Tensor
     Raises
     ------
     InputError
-        If the matrix does not fit the wavelengths of the prior.
+        If the matrix does not fit the wavelengths of the prior, or the noise is lost in rounding.
 
     Source: the module's.
     """
     signal, covariance = _moments(sensitivity, prior, noise)
     # The trace of S R' G^-1 R S is the squared norm of L^-1 R S with G = L L'.
-    explained = torch.linalg.solve_triangular(
-        torch.linalg.cholesky(covariance), signal, upper=False
-    )
+    explained = torch.linalg.solve_triangular(_root(covariance), signal, upper=False)
     left = prior.moment.trace() - explained.square().sum((-2, -1))
     return left / len(prior.wavelength)
 
@@ -161,7 +167,7 @@ def wiener(sensitivity: Tensor, prior: Prior, *, noise: Noise) -> Tensor:
     Parameters, errors and source are those of `expected_error`.
     """
     signal, covariance = _moments(sensitivity, prior, noise)
-    return torch.cholesky_solve(signal, torch.linalg.cholesky(covariance)).mT
+    return torch.cholesky_solve(signal, _root(covariance)).mT
 
 
 def estimator_error(
@@ -200,6 +206,17 @@ def _moments(sensitivity: Tensor, prior: Prior, noise: Noise) -> tuple[Tensor, T
     signal = sensitivity @ prior.moment
     variance = noise.variance(sensitivity, prior)
     return signal, signal @ sensitivity.mT + torch.diag_embed(variance)
+
+
+def _root(covariance: Tensor) -> Tensor:
+    """Return the Cholesky factor of the second moment of measurements."""
+    root, failed = torch.linalg.cholesky_ex(covariance)
+    if failed.any():
+        raise InputError(
+            "The noise is lost in rounding against filters as alike as these; give a lower SNR or "
+            "exposure (120 dB is plenty)."
+        )
+    return root
 
 
 # --- simpler figures ----------------------------------------------------------------------------
