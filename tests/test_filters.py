@@ -1,3 +1,5 @@
+"""Filter arrays: the recipes, the incoherent plate, tables from files, the command line."""
+
 import json
 from dataclasses import replace
 from importlib.resources import files as package_files
@@ -9,6 +11,7 @@ from tmm import coh_tmm
 from typer.testing import CliRunner
 
 from squilla.camera.design import CameraDesign
+from squilla.camera.twin import Camera
 from squilla.cli.filters import app
 from squilla.errors import InputError
 from squilla.optics.filters import (
@@ -297,7 +300,10 @@ def test_nothing_is_extrapolated_but_the_shift_at_the_edge():
         ("t.xlsx", "", "expected .toml"),
         ("t.csv", "500,0.1\n501,nan\n", "NaN"),
         ("t.mat", "no matlab", "cannot be read"),
-        ("t.toml", "layers = ['01']", "no filter array"),
+        ("t.npy", "", "cannot be read"),
+        ("t.npz", "", "cannot be read"),
+        ("t.nc", "", "cannot be read"),
+        ("t.toml", "layers = ['01']", "'material' is missing"),
         ("t.toml", "layers = ['02']", "no filter array"),
     ],
 )
@@ -305,6 +311,18 @@ def test_bad_files(tmp_path, name, content, message):
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError, match=message):
         read_filters(tmp_path / name)
+
+
+def test_a_place_that_cannot_be_written(tmp_path):
+    with pytest.raises(InputError, match="no folder"):
+        StencilRecipe().draw().save(tmp_path / "none" / "array.toml")
+
+
+def test_wedges_and_bands_that_cannot_be():
+    with pytest.raises(InputError, match="odd"):
+        linear_variable_filter(mirror=4)
+    with pytest.raises(InputError, match="width"):
+        band_pass(fwhm=0.0)
 
 
 def test_missing_file(tmp_path):
@@ -335,11 +353,28 @@ def test_analyse_takes_the_seed_of_the_camera():
     assert json.loads(result.output)["throughput"] == pytest.approx(response.mean().item())
 
 
+@pytest.mark.parametrize("name", ["band-pass", "mosaic-16", "sequential-16"])
+def test_analyse_shows_the_filters_that_the_camera_has(name):
+    """Not those of the thesis' recipe, and one for each channel, not for each lens."""
+    result = CliRunner().invoke(app, ["analyse", name, "--json"])
+    figures = json.loads(result.output)
+    response = Camera(name).filters.transmittance(grid())
+    assert figures["filters"] == len(response)
+    assert figures["throughput"] == pytest.approx(response.mean().item())
+
+
 def test_analyse_table():
     result = CliRunner().invoke(app, ["analyse", str(IMEC), "--wavelength", "400:1000:1", "--json"])
     assert json.loads(result.output)["wavelength"] == [400, 1000, 601]
 
 
 def test_analyse_refuses_nonsense():
-    for arguments in (["analyse", "thesisx"], ["analyse", "thesis", "--wavelength", "all"]):
-        assert isinstance(CliRunner().invoke(app, arguments).exception, InputError)
+    for arguments in (
+        ["thesisx"],
+        ["thesis", "--wavelength", "all"],
+        ["thesis", "--wavelength", "400:inf:1"],
+        ["thesis", "--wavelength", "400:1000:1"],
+        [str(IMEC), "--wavelength", "400:1000:1", "--seed", "3"],
+    ):
+        result = CliRunner().invoke(app, ["analyse", *arguments])
+        assert isinstance(result.exception, InputError), arguments

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from torch import Generator, Tensor
 
 from squilla.errors import InputError
+from squilla.files.disk import replacing
 from squilla.optics.materials import refractive_index
 from squilla.optics.tables import MeasuredFilters, read_table
 from squilla.optics.thinfilm import CACHED, Polarization, transmittance
@@ -108,7 +109,7 @@ class FilterArray:
         return plate.movedim(len(many), -2)
 
     def save(self, path: str | Path) -> None:
-        """Write the array to a TOML file that `read_filters` reads."""
+        """Write the array to a TOML file that `read_filters` reads; InputError if it cannot be."""
         if self.layers.ndim != 2:
             raise InputError(f"There are {len(self.layers)} arrays; save them one by one.")
         rows = ["".join("01"[int(layer)] for layer in row) for row in self.layers]
@@ -124,7 +125,8 @@ class FilterArray:
             *(f'    "{row}",' for row in rows),
             "]",
         ]
-        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        with replacing(path) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _broadcasts(shape: torch.Size, to: torch.Size) -> bool:
@@ -362,7 +364,17 @@ def linear_variable_filter(
         index.
     high, low, substrate, scatter
         As in `StencilRecipe`.
+
+    Raises
+    ------
+    InputError
+        If the mirrors have an even number of layers, or there is no filter.
     """
+    if mirror % 2 == 0 or filters < 1:
+        raise InputError(
+            f"A wedge of {filters} filters with mirrors of {mirror} layers cannot be; give an odd "
+            "number of layers, and one filter or more."
+        )
     peak = torch.linspace(*band, filters, dtype=torch.float64)
     middle = float(peak.mean())
     n = {name: float(refractive_index(name, middle)[0].real) for name in (high, low)}
@@ -433,5 +445,7 @@ def _read_design(path: Path) -> FilterArray:
         )
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} is no filter array as `save` writes it: {error!r}.") from None
+    except KeyError as error:
+        raise InputError(f"{path} is no filter array: {error} is missing or misread.") from None
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"{path} is no filter array as `save` writes it: {error}.") from None

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from squilla.errors import InputError
+from squilla.files.disk import reading
 from squilla.optics.angle import blue_shift
 from squilla.optics.materials import read_columns
 from squilla.spectra import grid
@@ -96,7 +97,17 @@ def band_pass(
         Transmittance at the peak, 0..1.
     effective_index : float, optional
         For the blue shift at an angle; None: no shift.
+
+    Raises
+    ------
+    InputError
+        If there is no filter, or its width is not positive.
     """
+    if filters < 1 or not fwhm > 0:
+        raise InputError(
+            f"{filters} band-passes {fwhm:g} nm wide are no array; give one or more, of a positive "
+            "width."
+        )
     wavelength = grid() if wavelength is None else np.asarray(wavelength, float)
     first, last = wavelength[[0, -1]]
     centre = first + (last - first) * (np.arange(filters) + 0.5) / filters
@@ -116,12 +127,8 @@ def read_table(
         raise InputError(
             f"Filters cannot be read from {path.name}; expected .toml, {', '.join(_KINDS)}."
         )
-    try:
+    with reading(path, "filter table"):
         values, own = read(path)
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise InputError(f"The filter table {path} cannot be read: {error}") from None
     wavelength = own if wavelength is None else np.asarray(wavelength, float)
     if wavelength is None:
         raise InputError(
@@ -156,14 +163,11 @@ def _matrix(variables: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
 
 def _read_mat(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
     try:
         variables = loadmat(path)
     except NotImplementedError:
         raise InputError(f"{path} is of MATLAB's version 7.3; save it with '-v7'.") from None
-    except MatReadError as error:
-        raise InputError(f"The filter table {path} cannot be read: {error}.") from None
     return _matrix({k: v for k, v in variables.items() if not k.startswith("__")})
 
 
