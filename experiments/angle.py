@@ -138,7 +138,7 @@ def linear(cameras: dict[str, Calibration]) -> dict:
 def spectra(cameras: dict[str, Calibration]) -> dict:
     """Return errors of point spectra at the axis and in the corner."""
     wavelength, corner = cameras["true"].wavelength, float(cameras["true"].angle[-1])
-    light = lights().on(wavelength)[lights().name.index(CHART_LIGHT)]
+    light = lights().one(CHART_LIGHT, wavelength)
     chart = torch.from_numpy(chart_reflectances().on(wavelength) * light).float()
     sets = {
         "natural": PRIORS["natural"](1500, wavelength, generator=torch.Generator().manual_seed(2)),

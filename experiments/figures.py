@@ -121,7 +121,7 @@ def bands_of(truth: np.ndarray) -> np.ndarray:
 def colour_figure(seen: Capture, pictures: dict[tuple[str, str], np.ndarray]):
     """Draw the colours of the bands at 650, 550 and 500 nm: a row for each training noise."""
     networks = [name for name in NETWORKS if any(name == column for _, column in pictures)]
-    white = bands_of(lights().on(grid())[lights().name.index(CHART_LIGHT)])
+    white = bands_of(lights().one(CHART_LIGHT, grid()))
     truth = bands_of(seen.truth)
     top = float(np.percentile((truth / white)[..., [3, 1, 0]], 99.5))
     figure = sheet(len(ROWS), 1 + len(networks), 1.0)

@@ -128,7 +128,7 @@ def learn(camera: squilla.Camera, case) -> squilla.Calibration:
             lessons["sweep"] = spoilt(lessons["sweep"], camera)
     else:
         wavelength, table = camera.design.wavelength, lights()
-        lamps = [table.on(wavelength)[table.name.index(name)] for name in LAMPS]
+        lamps = [table.one(name, wavelength) for name in LAMPS]
         if change:
             lamps += [np.exp(-4 * np.log(2) * ((wavelength - c) / w) ** 2) for c, w in LEDS]
         lessons["known"] = rehearsal.known(np.array(lamps))
@@ -170,7 +170,7 @@ def costs(calibration: squilla.Calibration, truth: np.ndarray) -> dict:
     """Return mean squared errors of spectra all over the field, with R true and as learnt."""
     wavelength = calibration.wavelength
     generator = torch.Generator().manual_seed(11)
-    light = lights().on(wavelength)[lights().name.index(CHART_LIGHT)]
+    light = lights().one(CHART_LIGHT, wavelength)
     chart = torch.from_numpy(chart_reflectances().on(wavelength) * light).float()
     spectra = {
         "natural": natural_spectra(1200, wavelength, generator=generator),

@@ -40,6 +40,22 @@ def test_demo_writes_everything(tmp_path):
         assert float(envi.tags(1)["wavelength"]) == 500
 
 
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"snr": float("nan")}, "finite SNR"),
+        ({"distance": float("inf")}, "positive distance"),
+        ({"scenes": ["chart", "moon"]}, "indian-pines"),
+        ({"models": ["magic"]}, "no model"),
+        ({"camera": "pinhole"}, "no camera design"),
+    ],
+)
+def test_what_cannot_be_shown_is_said_before_anything_is_made(tmp_path, given, says):
+    with pytest.raises(InputError, match=says):
+        demo(tmp_path / "demo", **given)
+    assert not (tmp_path / "demo").exists()
+
+
 def test_demo_needs_a_place(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be made"):

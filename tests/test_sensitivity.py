@@ -137,7 +137,7 @@ def test_nonsense_is_refused(truth):
 @pytest.fixture(scope="module")
 def shown():
     """Twelve surfaces under four lamps and nine single-colour LEDs, and their field angles."""
-    lamps = [lights().on(GRID)[lights().name.index(n)] for n in ("A", "FL11", "LED-B1", "D65")]
+    lamps = [lights().one(name, GRID) for name in ("A", "FL11", "LED-B1", "D65")]
     lamps += [np.exp(-(((GRID - c) / 12) ** 2)) for c in np.linspace(505, 745, 9)]
     surfaces = reflectances().on(GRID)[60:180:10]
     spectra = np.concatenate([surfaces * lamp for lamp in lamps])

@@ -210,6 +210,9 @@ def test_tables_are_physical():
         assert len(set(table.name)) == len(table.name), "a name must find one spectrum"
     with pytest.raises(InputError, match="no spectrum"):
         lights()["candle"]
+    with pytest.raises(InputError, match="candle"):
+        lights().one("candle", grid())
+    np.testing.assert_array_equal(lights().one(CHART_LIGHT, grid()), lights()[CHART_LIGHT])
 
 
 def test_training_never_sees_the_evaluation(monkeypatch):

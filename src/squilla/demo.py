@@ -5,6 +5,7 @@ those frames. The truth comes back at the end, to judge.
 """
 
 import json
+import math
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -68,6 +69,7 @@ def demo(
     camera : str or Path
         A camera design.
     scenes, models : iterable of str
+        Names of `squilla.camera.scenes.SCENES` or "doll"; names of models.
     distance : float
         Of the scenes, mm.
     snr : float
@@ -78,14 +80,29 @@ def demo(
     Returns
     -------
     dict
-        What ``metrics.json`` holds: scene -> model -> metric -> number.
+        What ``metrics.json`` holds: scene -> model -> metric -> number, and for each scene
+        "alignment_rms_px".
+
+    Raises
+    ------
+    InputError
+        If there is no such camera, scene or model, or a scene cannot be captured so.
     """
-    folder, models = Path(folder), list(models)
+    folder, scenes, models = Path(folder), list(scenes), list(models)
+    # Said now, not after minutes of calibration.
+    strangers = [name for name in scenes if name not in (*SCENES, "doll")]
+    if strangers or not math.isfinite(snr) or not 0 < distance < math.inf:
+        raise InputError(
+            f"The scenes {', '.join(scenes)} at {distance:g} mm and {snr:g} dB cannot be shown; "
+            f"there are {', '.join(SCENES)} and doll, at any positive distance and finite SNR."
+        )
+    for name in models:
+        model_class(name)
+    twin = Camera(camera)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"The folder {folder} cannot be made: {error.strerror}.") from error
-    twin = Camera(camera)
     with _progress() as progress, ThreadPoolExecutor(1) as pool:
         warm = pool.submit(_warm_up, models)
         learnt = _calibrate(twin, seed, progress)
@@ -94,8 +111,8 @@ def demo(
         trials, metrics = [], {}
         reconstructors = {name: load_model(name, calibration) for name in models}
         warm.result()
-        for number, name in enumerate(_counted(progress, "scenes", list(scenes))):
-            wavelength, size = twin.design.wavelength, twin.design.field.size
+        wavelength, size = twin.design.wavelength, twin.design.field.size
+        for number, name in enumerate(_counted(progress, "scenes", scenes)):
             if name == "doll":
                 scene, relief = solid_scene(wavelength, size, distance=distance)
             else:
@@ -120,7 +137,8 @@ def demo(
                 model: {**trial.metrics[model], "seconds": seconds[model]} for model in cubes
             }
             metrics[name]["alignment_rms_px"] = alignment_error(calibration, measurement, truth)
-        _write_json(folder / "metrics.json", metrics)
+        with replacing(folder / "metrics.json") as temporary:
+            temporary.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
         sections = [results_section(trials)]
         sections += [scene_section(trial) for trial in _counted(progress, "pictures", trials)]
         facts = {
@@ -164,7 +182,7 @@ def alignment_error(calibration: Calibration, measurement: Measurement, truth: T
 def _calibrate(twin: Camera, seed: int, progress: Progress) -> Calibration:
     """Rehearse the calibration, with a bar for its frames."""
     rehearsal = Rehearsal(twin, seed=seed, step=5.0, bandwidth=5.0)
-    steps = 2 * rehearsal.frames + rehearsal.frames + len(rehearsal.wavelengths) + 1
+    steps = 3 * rehearsal.frames + len(rehearsal.wavelengths) + 1  # darks of two exposures, flats
     task = progress.add_task("calibration frames", total=steps)
 
     def ticking(frames: Iterable[T]) -> Iterator[T]:
@@ -200,9 +218,7 @@ def _trial(
         estimates=cubes,
         seconds=seconds,
         text=_TEXT.get(name, ""),
-        light=None if light is None else lights().on(calibration.wavelength)[
-            lights().name.index(light)
-        ],
+        light=None if light is None else lights().one(light, calibration.wavelength),
         raw=raw,
         lattice=lattice,
         before=_unaligned(raw, calibration),
@@ -228,11 +244,6 @@ def _warm_up(models: Iterable[str]) -> None:
     camera = Calibration.from_sensitivity(response, np.linspace(500, 750, 51))
     for name in models:
         model_class(name)(camera)(torch.ones(2, 12))
-
-
-def _write_json(path: Path, content: dict) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def _counted(progress: Progress, name: str, items: list[T]) -> Iterator[T]:

@@ -60,6 +60,10 @@ class SpectralTable:
         """Return the values on another grid, (N, K'); refuses to extrapolate."""
         return resample(self.values, self.wavelength, wavelength)
 
+    def one(self, name: str, wavelength: np.ndarray) -> np.ndarray:
+        """Return the spectrum of a name on another grid, (K',); InputError if there is none."""
+        return resample(self[name], self.wavelength, wavelength)
+
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.name:
             raise InputError(f"There is no spectrum named {name!r}; there are {list(self.name)}.")
