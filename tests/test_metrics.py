@@ -168,10 +168,19 @@ def test_reference_is_brought_onto_the_cube():
     cube = labelled(np.tile(line[::10], (8, 8, 1)), grid()[::10])
     assert evaluate(cube, truth)["mse"] == pytest.approx(0, abs=1e-15)
     assert evaluate(cube.transpose("wavelength", "y", "x"), truth)["mse"] < 1e-15
+    with pytest.raises(InputError, match="dimension"):
+        evaluate(cube.rename(wavelength="band"), truth)
     with pytest.raises(InputError, match="extrapolated"):
         evaluate(cube, truth.isel(wavelength=slice(0, 100)))
     with pytest.raises(InputError, match="reference is"):
         evaluate(cube.values, truth.values)
+
+
+def test_dimensions_are_known_by_their_names():
+    random = np.random.default_rng(0).random((9, 8, 251))
+    cube = labelled(random, grid())
+    assert evaluate(cube.transpose("x", "wavelength", "y"), cube)["mse"] == 0
+    assert evaluate(cube, cube.transpose("x", "y", "wavelength"))["mse"] == 0
 
 
 # --- the chart -----------------------------------------------------------------------------------

@@ -208,6 +208,12 @@ def test_window_shows_the_spectrum_under_the_click(truth, monkeypatch):
         plt.close(figure)
 
 
+def test_only_cubes_are_shown(truth):
+    for wrong in (truth.values, truth[0], truth.drop_vars("wavelength")):
+        with pytest.raises(InputError, match=r"squilla\.labelled"):
+            show(wrong)
+
+
 # --- the report ----------------------------------------------------------------------------------
 
 
@@ -314,3 +320,16 @@ def test_report_with_little_to_show(truth, estimates, tmp_path):
         Trial("x", truth, {})
     with pytest.raises(InputError, match="resample"):
         Trial("x", truth, {"m": truth[..., ::2]})
+    with pytest.raises(InputError, match="30 x 60 px"):
+        Trial("x", truth, {"m": truth[::2]})
+
+
+@pytest.mark.parametrize(
+    ("side", "wavelength"),
+    [(2, grid()), (9, np.array([600.0])), (9, np.linspace(900, 1000, 11))],
+    ids=["tiny", "one band", "infrared"],
+)
+def test_every_cube_can_be_shown(side, wavelength):
+    values = np.random.default_rng(0).random((side, side, len(wavelength)))
+    cube = labelled(values.astype(np.float32), wavelength)
+    assert len(scene_section(Trial("small", cube, {"same": cube})).parts) == 5

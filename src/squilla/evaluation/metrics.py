@@ -183,8 +183,8 @@ def evaluate(
     Parameters
     ----------
     cube, reference : DataArray or array, (..., K)
-        In one unit. Where both are DataArrays the reference is brought onto the wavelengths of
-        the cube.
+        In one unit. Where both are DataArrays the reference is brought onto the wavelengths, and
+        into the order of dimensions, of the cube.
     mask : array, (...), bool, optional
         Pixels that count.
 
@@ -249,6 +249,15 @@ def _paired(
     cube: DataArray | np.ndarray, reference: DataArray | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return estimate and truth as arrays of one shape, on the wavelengths of the estimate."""
+    for each in (cube, reference):
+        if isinstance(each, DataArray) and "wavelength" not in each.dims:
+            raise InputError(f'A cube has a dimension "wavelength"; this one has {each.dims}.')
+    if (
+        isinstance(cube, DataArray)
+        and isinstance(reference, DataArray)
+        and set(cube.dims) == set(reference.dims)
+    ):
+        reference = reference.transpose(*cube.dims)
     estimate, truth = (
         np.asarray(each.transpose(..., "wavelength") if isinstance(each, DataArray) else each)
         for each in (cube, reference)

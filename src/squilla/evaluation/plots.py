@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from xarray import DataArray
 
+from squilla.errors import InputError
 from squilla.evaluation.metrics import DARKEST, mse
 from squilla.evaluation.style import (
     COLOURS,
@@ -23,6 +24,7 @@ from squilla.evaluation.style import (
     sheet,
     styled,
 )
+from squilla.files.lazy import DIMS
 from squilla.spectra import composite, rgb, tristimulus
 
 if TYPE_CHECKING:
@@ -80,12 +82,14 @@ def band_figure(
     truth : DataArray, (y, x, wavelength)
     estimates : mapping of model name to DataArray, (y, x, wavelength)
     bands : sequence of float
-        nm; the nearest bands are shown, those beyond the cube not.
+        nm; the nearest bands are shown, those beyond the cube not. Where all are, the bands at its
+        ends and in its middle.
 
     Source: thesis, figures A.2 to A.4.
     """
     ends = _bands(truth)[[0, -1]] + (-1, 1)
     bands = [band for band in bands if ends[0] <= band <= ends[1]]
+    bands = bands or list(np.unique(_bands(truth)[[0, len(_bands(truth)) // 2, -1]]))
     cubes = {"truth": truth, **estimates}
     figure = sheet(len(cubes), len(bands), truth.shape[0] / truth.shape[1])
     grid = np.reshape(np.array(figure.axes, object), (len(cubes), len(bands)))
@@ -222,11 +226,14 @@ def distinct_points(cube: DataArray, count: int = 6) -> list[tuple[int, int]]:
     """
     from scipy.ndimage import uniform_filter
 
-    step = max(1, min(cube.shape[:2]) // 40)
+    height, width = cube.shape[:2]
+    step = max(1, min(height, width) // 40)
     window = 2 * step + 1
+    first = step if min(height, width) >= window else 0  # of a picture of 2 px all is rim
+    some = (slice(first, height - first, step), slice(first, width - first, step))
     bands = np.nan_to_num(cube.values[..., :: max(1, cube.shape[-1] // 16)])
-    mean = uniform_filter(bands, window, axes=(0, 1))[step:-step:step, step:-step:step]
-    spread = uniform_filter(bands**2, window, axes=(0, 1))[step:-step:step, step:-step:step]
+    mean = uniform_filter(bands, window, axes=(0, 1))[some]
+    spread = uniform_filter(bands**2, window, axes=(0, 1))[some]
     spread = np.sqrt(np.maximum(spread - mean**2, 0)).mean(-1)
     level = mean.max(-1)
     shape = mean / np.maximum(level, 1e-12)[..., None]
@@ -243,7 +250,7 @@ def distinct_points(cube: DataArray, count: int = 6) -> list[tuple[int, int]]:
         nearest = np.minimum(nearest, np.linalg.norm(shape - shape[place], axis=-1))
         place = np.unravel_index(np.argmax(nearest * worth), level.shape)
         found.append(place)
-    return sorted((step + int(row) * step, step + int(column) * step) for row, column in found)
+    return sorted((first + int(row) * step, first + int(column) * step) for row, column in found)
 
 
 def _draw_spectra(
@@ -267,7 +274,8 @@ def _draw_spectra(
             panel.plot(wavelength, spectra[number] / peak, color=colour, label=model)
             errors.append((float(mse(spectra[number] / peak, reference)), colour))
         _headline(panel, name, errors)
-        panel.set_xlim(wavelength[0], wavelength[-1])
+        if len(wavelength) > 1:
+            panel.set_xlim(wavelength[0], wavelength[-1])
         panel.set_ylim(0, 1.25)
         panel.set_yticks([0, 0.5, 1])
         panel.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 5, 10]))
@@ -319,14 +327,25 @@ def show(cube: DataArray) -> None:
     Parameters
     ----------
     cube : DataArray, (y, x, wavelength)
+
+    Raises
+    ------
+    InputError
+        If it is no such cube.
     """
     import matplotlib.pyplot as plt
 
+    if not isinstance(cube, DataArray) or cube.dims != DIMS or "wavelength" not in cube.coords:
+        raise InputError(
+            "A DataArray (y, x, wavelength) can be shown; make one of an array and its wavelengths "
+            "with squilla.labelled."
+        )
     figure = plt.figure(figsize=(WIDTH, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
     draw_picture(left, rgb(cube.values, _bands(cube)), str(cube.name or ""))
     right.set(xlabel="wavelength (nm)", ylabel=str(cube.attrs.get("units", "radiance")))
-    right.set_xlim(*_bands(cube)[[0, -1]])
+    if cube.shape[2] > 1:
+        right.set_xlim(*_bands(cube)[[0, -1]])
     picked = 0
 
     def pick(row: int, column: int) -> None:
@@ -357,7 +376,7 @@ def _exposures(truth: DataArray, light: np.ndarray | None) -> tuple[float, float
     wavelength = _bands(truth)
     white = np.ones(len(wavelength)) if light is None else np.asarray(light, float)
     luminance = tristimulus(np.nan_to_num(truth.values), wavelength)[..., 1]
-    luminance = luminance / tristimulus(white, wavelength)[1]
+    luminance = luminance / max(float(tristimulus(white, wavelength)[1]), 1e-12)
     nearest = [int(np.abs(wavelength - band).argmin()) for band in (650, 550, 500)]
     shown = truth.values[..., nearest] / np.maximum(white[nearest], 1e-12)
     return float(np.percentile(luminance, 99)), float(np.nanpercentile(shown, 99.5))

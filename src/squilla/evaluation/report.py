@@ -69,12 +69,16 @@ class Trial:
         if not self.estimates:
             raise InputError(f"Nothing was reconstructed of {self.name}; there is nothing to show.")
         for model, cube in self.estimates.items():
-            if cube.shape != self.truth.shape or not np.allclose(
-                cube["wavelength"], self.truth["wavelength"]
-            ):
+            if cube.shape[:2] != self.truth.shape[:2]:
                 raise InputError(
-                    f"{model} shows {self.name} in {cube.shape}, its truth is {self.truth.shape}, "
-                    "or their wavelengths differ; resample the truth first."
+                    f"{model} shows {self.name} in {cube.shape[0]} x {cube.shape[1]} px, its truth "
+                    f"has {self.truth.shape[0]} x {self.truth.shape[1]}; cut or resize one of them."
+                )
+            own, true = (each["wavelength"].values for each in (cube, self.truth))
+            if len(own) != len(true) or not np.allclose(own, true):
+                raise InputError(
+                    f"{model} and the truth of {self.name} have other wavelengths; resample the "
+                    "truth first (squilla.spectra.resample)."
                 )
 
     @cached_property
