@@ -296,6 +296,11 @@ def test_senseless_settings_are_refused():
         train("ridge", CAMERA)
     with pytest.raises(InputError, match="positive"):
         train("mlp", CAMERA, epochs=0)
+    with pytest.raises(InputError, match="positive"):
+        train("compound", CAMERA, count=-1)
+    for noise in ([15, 20], "20", (15.0, 20.0, 25.0)):
+        with pytest.raises(InputError, match="pair"):
+            train("mlp", CAMERA, noise=noise)
     with pytest.raises(InputError, match="no schedule"):
         train("mlp", CAMERA, schedule="linear")
     with pytest.raises(InputError, match="no precision"):
@@ -303,8 +308,23 @@ def test_senseless_settings_are_refused():
     for device in ("cuda:99", "abacus"):
         with pytest.raises(InputError, match="no device"):
             train("mlp", CAMERA, device=device)
+    with pytest.raises(InputError, match="seed"):
+        train("mlp", CAMERA, seed=-1)
     with pytest.raises(InputError, match="diverged"):
         train("mlp", CAMERA, **SHORT, learning_rate=1e9)
+
+
+def test_files_are_looked_for_before_the_training(tmp_path):
+    for name in ("log", "checkpoint"):
+        with pytest.raises(InputError, match="no such folder"):
+            train("mlp", CAMERA, **{name: tmp_path / "none" / "file"})
+
+
+def test_compound_refuses_what_it_does_not_take(monkeypatch):
+    with pytest.raises(InputError, match="leave out noise, look"):
+        train("compound", CAMERA, noise=20, look=print)
+    with pytest.raises(InputError, match="leave out precision"):
+        train("compound", CAMERA, precision="bfloat16")
 
 
 # --- the command ----------------------------------------------------------------------------

@@ -46,6 +46,8 @@ class Samples:
             )
         if self.count < 1:
             raise InputError(f"{self.count} spectra are not enough; give at least one.")
+        if self.seed < 0:
+            raise InputError(f"The seed is {self.seed}; give 0 or more.")
         if not (0 <= self.gain_error < 1 and 0 <= self.dropped <= 0.5):
             raise InputError(
                 f"Errors of R of {self.gain_error:g} and {self.dropped:g} of the channels dropped "

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any, Literal
 
@@ -71,8 +72,8 @@ def train(
     name : str
         A network of `models`: "mlp", "cnn", "rescnn", "unet", "respecnn"; or "compound", which
         learns a prior on the camera's wavelengths first, paints scenes of its own and draws every
-        noise (`training.compound`); of these settings it takes the number of steps, the seed, and
-        those from `device` on.
+        noise (`training.compound`): it takes the number of steps that `count`, `epochs` and
+        `batch` make, `seed`, `device`, `log`, `checkpoint` and `progress`, and refuses the others.
     calibration : Calibration
         With several field angles, every sample gets one at random.
     noise : None, float, (float, float) or SensorNoise
@@ -95,8 +96,8 @@ def train(
     schedule : "constant" or "cosine"
         Whether the learning rate stays (the thesis) or falls to zero along half a cosine.
     seed : int
-        Of the first weights, the spectra, the noise and the order. The same seed gives the same
-        weights to the bit, on one machine's CPU with one number of threads.
+        0 or more; of the first weights, the spectra, the noise and the order. The same seed gives
+        the same weights to the bit, on one machine's CPU with one number of threads.
     device : str, optional
         "cpu", "cuda" or "cuda:1"; default: CUDA where there is one.
     precision : "float32", "tf32" or "bfloat16"
@@ -129,14 +130,32 @@ def train(
     kind = model_class(name)
     if not kind.trained:
         raise InputError(f"`{name}` is computed from the calibration and needs no training.")
-    if epochs < 1 or batch < 1 or not learning_rate > 0:
-        raise InputError("Epochs, batch and learning rate must be positive.")
+    if min(count, epochs, batch) < 1 or not 0 < learning_rate < math.inf:
+        raise InputError(
+            f"{epochs} epochs of {count} spectra in batches of {batch} at a learning rate of "
+            f"{learning_rate:g} are no training; all four must be positive."
+        )
     if schedule not in ("constant", "cosine"):
         raise InputError(f"There is no schedule {schedule!r}; there are constant and cosine.")
+    for file in (log, checkpoint):
+        if file is not None and not Path(file).resolve().parent.is_dir():
+            raise InputError(f"{file} cannot be written: there is no such folder; make it first.")
     if kind.universal:
         from squilla.training.compound import Recipe, train_compound
 
+        own = {
+            "noise": noise, "gain_error": gain_error, "dropped": dropped, "spectra": spectra,
+            "fresh": fresh, "learning_rate": learning_rate, "schedule": schedule,
+            "precision": precision, "look": look,
+        }  # fmt: skip
+        usual = signature(train).parameters
+        if useless := [key for key, value in own.items() if value != usual[key].default]:
+            raise InputError(
+                f"`{name}` draws scenes and noise of its own; leave out {', '.join(useless)}."
+            )
         with joined(device) as processes:
+            if processes.count > 1:
+                raise InputError(f"`{name}` is trained by one process; start it without torchrun.")
             return train_compound(
                 calibration,
                 Recipe(steps=epochs * math.ceil(count / batch), seed=seed),
@@ -180,7 +199,7 @@ def train(
                 written = time.monotonic()
                 free = written + (written - now) / CHECKPOINTING
             if look is not None and (last or (epoch + 1) % LOOK_EVERY == 0):
-                look(epoch, *run.shown())
+                look(epoch, *run.looked_at())
         return run.finished()
 
 
@@ -227,7 +246,7 @@ class _Run:
             "learning_rate": rate,
             "seconds": round(time.perf_counter() - began, 3),
         }
-        if not math.isfinite(entry["loss"]):
+        if not math.isfinite(entry["loss"] + entry["validation"]):
             raise InputError(f"The training diverged in epoch {epoch}; lower the learning rate.")
         self.history.append(entry)
 
@@ -268,7 +287,7 @@ class _Run:
         return total / VALIDATION
 
     @torch.inference_mode()
-    def shown(self) -> tuple[Tensor, Tensor]:
+    def looked_at(self) -> tuple[Tensor, Tensor]:
         """Return some spectra never trained on, and what the network makes of them."""
         y, angle, x = (part[:LOOKED_AT] for part in self.validation[0])
         return x.cpu(), self._estimate(y, angle).cpu()
@@ -320,13 +339,20 @@ class _Run:
 
 
 def _named(noise: Noise) -> str:
-    if noise is None:
-        return "none"
-    if isinstance(noise, SensorNoise):
-        return str(noise)
-    if isinstance(noise, tuple):
-        return f"{noise[0]:g}-{noise[1]:g} dB"
-    return f"{noise:g} dB"
+    """Say what a noise is; InputError if it is none."""
+    match noise:
+        case None:
+            return "none"
+        case SensorNoise():
+            return str(noise)
+        case (int() | float() as low, int() | float() as high) if isinstance(noise, tuple):
+            return f"{low:g}-{high:g} dB"
+        case int() | float():
+            return f"{noise:g} dB"
+    raise InputError(
+        f"The noise {noise!r} is none; give None, a number of dB, a pair such as (15, 20), or a "
+        "SensorNoise."
+    )
 
 
 @contextmanager
