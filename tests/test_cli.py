@@ -173,10 +173,17 @@ def test_the_printed_design_is_a_design(tmp_path):
 
 def test_models_and_help():
     assert "ridge" in json.loads(run("models", "--json"))
-    commands = re.findall(r"^  ([a-z]+) ", run("--help").split("Commands:")[1], re.M)
+    helped = run("--help")
+    assert "..." not in helped.split("Commands:")[1], "each is told in a whole sentence"
+    commands = listed(helped)
+    assert {"filters", "twin-camera"} <= set(commands)
+    commands += [f"filters {command}" for command in listed(run("filters", "--help"))]
     for command in commands:
-        helped = run(command, "--help")
-        assert re.search("Examples?:|Commands:", helped), command
+        assert re.search("Examples?:|Commands:", run(*command.split(), "--help")), command
+
+
+def listed(helped: str) -> list[str]:
+    return re.findall(r"^  ([a-z-]+) ", helped.split("Commands:")[1], re.M)
 
 
 CAPTURE = "simulate chart -o {t}/raw.tiff --camera {b}/small.toml"
@@ -190,8 +197,14 @@ BAD = {
     "foreign camera": "camera {b}/raw.tiff",
     "SNR and exposure": CAPTURE + " --snr 20 --exposure 3",
     "zero exposure": CAPTURE + " --exposure 0",
+    "SNR of no number": CAPTURE + " --snr nan",
+    "truth of no kind": CAPTURE + " --truth {t}/truth.doc",
+    "rehearsal too near": "rehearse -o {t}/r --camera {b}/small.toml --distance 1",
+    "rehearsal without end": "rehearse -o {t}/r --camera {b}/small.toml --step nan",
+    "no place for a demo": "demo -o {b}/raw.tiff --camera {b}/small.toml",
     "SNR out of reach": CAPTURE + " --snr 90",
     "too near": CAPTURE + " --distance 2",
+    "too far": CAPTURE + " --distance inf",
     "foreign depth map": CAPTURE + " --depth {b}/small.toml",
     "empty depth map": CAPTURE + " --depth {t}/empty.npy",
     "impossible distance": RECONSTRUCT + " {b}/raw.tiff --distance 0",
@@ -203,6 +216,7 @@ BAD = {
     "colour picture": RECONSTRUCT + " {t}/rgb.tiff",
     "dark frame": RECONSTRUCT + " {t}/dark.tiff",
     "saturated": RECONSTRUCT + " {t}/white.tiff",
+    "infinitely far": RECONSTRUCT + " {b}/raw.tiff --distance inf",
     "no such model": RECONSTRUCT + " {b}/raw.tiff --model magic",
     "a model of another camera": RECONSTRUCT + " {b}/raw.tiff --model mlp",
     "many into a file": RECONSTRUCT + " {b}/raw.tiff {b}/raw.tiff",
@@ -212,6 +226,15 @@ BAD = {
     "frames of another camera": CALIBRATE + " --dark {b}/frames/dark --sweep {b}/frames/sweep",
     "sweep without a table": CALIBRATE
     + " --camera {b}/small.toml --dark {b}/frames/dark --sweep {b}/frames/flat",
+    "calibration of another kind": "calibrate -o {t}/c.json --dark {b}/x --flat {b}/x",
+    "calibration into a folder": "calibrate -o {t} --dark {b}/x --flat {b}/x",
+    "distance of no target": CALIBRATE + " --dark {b}/x --target-distance 300",
+    "live, too near": "live --calibration {b}/camera.nc --distance -1",
+    "memory of no size": "view {b}/truth.nc --memory nan",
+    "views of no kind": "align {b}/raw.tiff --shape 2x2 -o {t}/views.doc",
+    "empty filter table": "filters analyse {t}/empty.npz",
+    "filters into a folder": "filters design -o {t}",
+    "filters of no noise": "filters design -o {t}/a.toml --snr nan",
     "other reference": "evaluate {b}/truth.nc --reference {b}/camera.nc -o {t}/v",
 }
 
@@ -221,6 +244,7 @@ def test_bad_input_is_one_sentence_and_leaves_nothing(bench, tmp_path, name):
     frame = tifffile.imread(bench / "raw.tiff")
     (tmp_path / "cut.tiff").write_bytes((bench / "raw.tiff").read_bytes()[:5000])
     np.save(tmp_path / "empty.npy", np.zeros((0, 5)))
+    (tmp_path / "empty.npz").touch()
     tifffile.imwrite(tmp_path / "small.tiff", frame[:100])
     tifffile.imwrite(tmp_path / "rgb.tiff", np.zeros((480, 500, 3), np.uint8), photometric="rgb")
     tifffile.imwrite(tmp_path / "dark.tiff", np.full_like(frame, 64))

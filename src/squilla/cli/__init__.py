@@ -1,6 +1,7 @@
 """The command line, ``squilla``."""
 
 import sys
+import warnings
 
 
 def main() -> None:
@@ -8,6 +9,7 @@ def main() -> None:
     from squilla.cli.app import app
     from squilla.errors import InputError
 
+    warnings.showwarning = _warn
     try:
         app(prog_name="squilla")
     except InputError as error:
@@ -16,3 +18,8 @@ def main() -> None:
     except KeyboardInterrupt:
         print("squilla: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _warn(message: Warning | str, *_: object, **__: object) -> None:
+    """Say a warning as an error is said: to the person, not to who wrote the line."""
+    print(f"squilla: {message}", file=sys.stderr)

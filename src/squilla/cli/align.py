@@ -16,7 +16,9 @@ def align(
     reference: Annotated[int | None, typer.Option(help="Unit that stays where it is.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Align sub-images that are cut out already, of any array of lenses or cameras.
+    """Align the sub-images of any array of lenses or cameras.
+
+    They are cut out already, and stacked row by row.
 
     Example: squilla align views.tiff --shape 3x3 -o aligned.tiff
     """
@@ -24,21 +26,22 @@ def align(
     import tifffile
 
     from squilla.calibration.stack import agreement, align_stack
+    from squilla.cli.checks import check_file
     from squilla.files.disk import existing, reading, replacing
 
     try:
         rows, columns = (int(part) for part in shape.lower().split("x"))
     except ValueError as error:
         raise InputError(f"The shape is rows x columns, such as 3x3, not {shape!r}.") from error
-    if output.suffix not in (".npy", ".tif", ".tiff"):
-        raise InputError(f"{output} must end in .npy or .tiff.")
+    check_file(output, (".npy", ".tiff", ".tif"))
     path = existing(stack)
     with reading(path, "stack of sub-images"):
-        images = np.load(path) if path.suffix == ".npy" else tifffile.imread(path)
+        npy = path.suffix.lower() == ".npy"
+        images = np.load(path) if npy else tifffile.imread(path)
     aligned = align_stack(images, (rows, columns), reference=reference)
     pages = np.where(aligned.valid, aligned.y, np.nan).transpose(2, 0, 1).astype(np.float32)
     with replacing(output) as temporary, temporary.open("wb") as stream:
-        if output.suffix == ".npy":
+        if output.suffix.lower() == ".npy":
             np.save(stream, pages)
         else:
             tifffile.imwrite(stream, pages)

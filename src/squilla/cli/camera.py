@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -73,9 +74,9 @@ def _barriers(design: "CameraDesign") -> str:
 
 def rehearse(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
-    camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
+    camera: Annotated[str, typer.Option(help="A built-in design, or a TOML file.")] = "thesis",
     step: Annotated[float, typer.Option(help="Of the sweep, nm.")] = 5.0,
-    frames: Annotated[int, typer.Option(help="Darks and flats of each exposure.")] = 8,
+    frames: Annotated[int, typer.Option(min=2, help="Darks and flats of each exposure.")] = 8,
     distance: Annotated[float, typer.Option(help="Of the poster, mm.")] = 300.0,
     power_error: Annotated[float, typer.Option(help="Of the reference detector, relative.")] = 0.0,
     known: Annotated[
@@ -83,7 +84,7 @@ def rehearse(
     ] = False,
     seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of all noise.")] = 0,
 ) -> None:
-    """Let the twin take all calibration frames that `squilla calibrate` wants.
+    """Let the twin take the frames that a calibration wants.
 
     Example: squilla rehearse -o frames
     """
@@ -91,22 +92,25 @@ def rehearse(
 
     from squilla.calibration.rehearsal import Rehearsal
     from squilla.camera.twin import Camera
+    from squilla.cli.checks import check_distance, make_folder
     from squilla.errors import InputError
     from squilla.files.disk import replacing
     from squilla.files.raw import write_raw
 
-    if not step > 0 or frames < 2:
-        raise InputError("The step must be positive and the number of frames at least 2.")
+    if not (0.01 <= step < math.inf and 0 <= power_error < 1):
+        raise InputError(
+            f"A step of {step:g} nm and a power error of {power_error:g} make no sweep; give a "
+            "step of 0.01 nm or more and an error from 0 to below 1."
+        )
+    check_distance(distance)
     twin = Camera(camera)
     rehearsal = Rehearsal(
         twin, seed=seed, frames=frames, step=step, bandwidth=step,
         power_error=power_error, distance=distance,
     )  # fmt: skip
+    target = rehearsal.target()  # first, for it says whether the distance can be
     for folder in ("dark", "flat", "sweep"):
-        try:
-            (output / folder).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"The folder {output} cannot be made: {error.strerror}.") from error
+        make_folder(output / folder)
     for number, raw in enumerate(track(rehearsal.dark(), "darks", total=2 * frames)):
         write_raw(output / "dark" / f"{number:03d}.tiff", raw)
     for number, raw in enumerate(track(rehearsal.flat(), "flats", total=frames)):
@@ -122,7 +126,7 @@ def rehearse(
         temporary.open("w", newline="", encoding="utf-8") as stream,
     ):
         csv.writer(stream).writerows(table)
-    write_raw(output / "target.tiff", rehearsal.target())
+    write_raw(output / "target.tiff", target)
     if known:
         _write_known(rehearsal, output / "known")
     typer.echo(

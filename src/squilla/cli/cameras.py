@@ -13,10 +13,10 @@ from squilla.errors import InputError
 def cameras(
     as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False,
 ) -> None:
-    """List the GenICam cameras that answer, with the formats that squilla can read.
+    """List the GenICam cameras that answer.
 
-    Looks on all networks and USB ports (libaravis), and at the vendors' GenTL producers that
-    GENICAM_GENTL64_PATH lists.
+    Each is told with its pixel formats that squilla can read. Looks on all networks and USB ports
+    (libaravis), and at the vendors' GenTL producers that GENICAM_GENTL64_PATH lists.
 
     Example: squilla cameras
     """
@@ -77,9 +77,10 @@ def grab(
     timeout: Annotated[float, typer.Option(help="For a frame, s.")] = 10.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the counts as JSON.")] = False,
 ) -> None:
-    """Write frames of a live camera as TIFF, to calibrate from or to reconstruct.
+    """Write frames of a live camera as TIFF.
 
-    Each carries its exposure, gain, pixel format, number and camera.
+    They serve to calibrate from, or to reconstruct. Each carries its exposure, gain, pixel format,
+    number and camera.
 
     Example: squilla grab --source genicam: --count 8 --exposure 20 -o frames/dark
     """
@@ -87,13 +88,11 @@ def grab(
 
     from rich.progress import track
 
+    from squilla.cli.checks import make_folder
     from squilla.files.raw import write_raw
     from squilla.live.genicam import open_camera
 
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"The folder {output} cannot be made: {error.strerror}.") from error
+    make_folder(output)
     with open_camera(
         source, pixel_format=pixel_format, report=lambda said: print(said, file=sys.stderr)
     ) as camera:
@@ -116,7 +115,7 @@ def grab(
 
 
 def twin_camera(
-    camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
+    camera: Annotated[str, typer.Option(help="A built-in design, or a TOML file.")] = "thesis",
     scene: Annotated[
         str, typer.Option(help="chart, indian-pines, corn-kernel, a file; white, or dark.")
     ] = "chart",
@@ -127,18 +126,21 @@ def twin_camera(
     address: Annotated[str, typer.Option(help="Of this machine.")] = "127.0.0.1",
     seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of the noise.")] = 0,
 ) -> None:
-    """Be a GigE Vision camera that shows what the twin sees, until Ctrl-C.
+    """Be a GigE Vision camera that sends what the twin sees.
 
-    Any GenICam client may open it, set its exposure, gain, region, format and trigger.
+    Any GenICam client may open it, set its exposure, gain, region, format and trigger. Ctrl-C
+    ends it.
 
     Example: squilla twin-camera --scene chart --fps 5
     """
     import time
 
     from squilla.camera.twin import Camera
+    from squilla.cli.checks import check_distance
     from squilla.live.twin_camera import TwinCamera
     from squilla.live.twin_frames import TwinFrames, views
 
+    check_distance(distance)
     twin = Camera(camera)
     frames = TwinFrames(twin, views(twin, scene, distance, moving=moving), seed)
     with TwinCamera(frames, rate=fps, address=address, lost=lost) as sender:

@@ -20,7 +20,8 @@ app = typer.Typer(
 )
 
 SnrOption = Annotated[
-    float | None, typer.Option(metavar="DB", help="Noise as strong in every filter; default: 20 dB.")
+    float | None,
+    typer.Option(metavar="DB", help="Noise alike in every filter; default: 20 dB."),
 ]
 ExposureOption = Annotated[
     float | None,
@@ -52,7 +53,8 @@ def analyse(
         ),
     ],
     seed: Annotated[
-        int | None, typer.Option(help="Seed of a camera's random array; default: its own.")
+        int | None,
+        typer.Option(min=0, max=10**9, help="Seed of a camera's random array; default: its own."),
     ] = None,
     wavelength: Annotated[
         str | None,
@@ -62,7 +64,9 @@ def analyse(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print how well the filters tell wavelengths apart, and how much light they pass.
+    """Print how well filters tell wavelengths apart.
+
+    Beside that: how much light they pass, and what error they leave in reconstructed spectra.
 
     Examples: squilla filters analyse thesis --seed 3;
     squilla filters analyse measured.mat --wavelength 400:1000:1
@@ -135,14 +139,16 @@ def design(
     draws: Annotated[int, typer.Option(help="Arrays drawn at random.")] = 1000,
     starts: Annotated[int, typer.Option(help="How many of the best are improved.")] = 3,
     rounds: Annotated[int, typer.Option(help="Rounds of improvement for each.")] = 8,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same array.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=10**9, help="The same seed gives the same array.")
+    ] = 0,
     plot: Annotated[Path | None, typer.Option(help="Draw what was gained, .png .pdf .svg")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Search for the filters that leave the least error in reconstructed spectra.
+    """Search for the filters that leave the least error.
 
-    Many arrays are drawn at random; from the best of them masks are exchanged and thicknesses
-    refined, within the limits of the process.
+    The error is that of linearly reconstructed spectra. Many arrays are drawn at random; from the
+    best of them masks are exchanged and thicknesses refined, within the limits of the process.
 
     Examples: squilla filters design --snr 20 -o array.toml --plot gained.png;
     squilla filters design --recipe free --exposure 1000 -o array.toml
@@ -151,7 +157,9 @@ def design(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from squilla.camera.design import CameraDesign
+    from squilla.cli.checks import check_file
     from squilla.errors import InputError
+    from squilla.files.disk import replacing
     from squilla.optics.design import optimise
     from squilla.optics.filters import FabryPerotRecipe, FreeRecipe, StencilRecipe
     from squilla.optics.merit import expected_error, throughput
@@ -159,12 +167,9 @@ def design(
     kinds = {"stencil": StencilRecipe, "free": FreeRecipe, "fabry-perot": FabryPerotRecipe}
     if recipe not in kinds:
         raise InputError(f"There is no recipe {recipe!r}; there are {', '.join(kinds)}.")
-    if output.suffix.lower() != ".toml" or not output.parent.is_dir():
-        raise InputError(f"{output} cannot be written: give a .toml file in a folder that exists.")
-    if plot is not None and not (plot.suffix in (".png", ".pdf", ".svg") and plot.parent.is_dir()):
-        raise InputError(
-            f"{plot} cannot be drawn: give a .png, .pdf or .svg in a folder that exists."
-        )
+    check_file(output, (".toml",))
+    if plot is not None:
+        check_file(plot, (".png", ".pdf", ".svg"))
     paper = CameraDesign.load(camera)
     known, noise, efficiency = _figure_of_merit(paper, prior, snr, exposure)
     band = known.wavelength
@@ -194,7 +199,9 @@ def design(
     if plot is not None:
         from squilla.optics.plots import plot_search
 
-        plot_search(found, band, f"{recipe}, {noise}").savefig(plot, dpi=150)
+        figure = plot_search(found, band, f"{recipe}, {noise}")
+        with replacing(plot) as temporary:
+            figure.savefig(temporary, format=plot.suffix[1:].lower(), dpi=150)
     figures = {
         "median_drawn": float(found.drawn.median()),
         "best_drawn": float(found.drawn.min()),
@@ -233,12 +240,13 @@ def tolerance(
     prior: PriorOption = "natural",
     camera: CameraOption = "thesis",
     count: Annotated[int, typer.Option(min=1, help="How often the array is coated.")] = 1000,
-    seed: Annotated[int, typer.Option(help="Of the random faults.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of the random faults.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Print what faults of the coating cost, with and without calibrating the array anew.
+    """Print what faults of the coating cost.
 
-    Faults are standard deviations. Without any, each is tried alone at 1 %.
+    Once to the estimator of the array as designed, once after calibrating anew. Faults are standard
+    deviations. Without any, each is tried alone at 1 %.
 
     Examples: squilla filters tolerance array.toml;
     squilla filters tolerance array.toml --deposition 0.5 --index TiO2/Franta=TiO2/Siefke
@@ -318,7 +326,9 @@ def _filters(
         array = read_filters(name, wavelength=wavelength)
         return array, grid() if isinstance(array, FilterArray) else array.wavelength
     if wavelength is not None:
-        raise InputError(f"--wavelength is for a table of filters; the camera {name} knows its own.")
+        raise InputError(
+            f"--wavelength is for a table of filters; the camera {name} knows its own."
+        )
     camera = CameraDesign.load(name)
     if seed is not None:
         drawn = {"seed": seed}

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,13 +24,15 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
-    camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
+    camera: Annotated[str, typer.Option(help="A built-in design, or a TOML file.")] = "thesis",
     snr: Annotated[float, typer.Option(help="Of the captures, dB.")] = 20.0,
     distance: Annotated[float, typer.Option(help="Of the scenes, mm.")] = 300.0,
     seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of all noise.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Send three scenes through the camera and back, and write a report.
+    """Send four scenes through the camera and back.
+
+    Writes raw frames, the calibration, cubes, metrics.json and report.html.
 
     Example: squilla demo -o demo
     """
@@ -59,10 +62,10 @@ def simulate(
         str, typer.Argument(help="chart, indian-pines, corn-kernel, doll, or a file.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Raw frame to write.")],
-    camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
+    camera: Annotated[str, typer.Option(help="A built-in design, or a TOML file.")] = "thesis",
     distance: Annotated[float, typer.Option(help="Of a plane scene, mm.")] = 300.0,
     depth: Annotated[Path | None, typer.Option(help="Depth map, mm: .npy or .tiff.")] = None,
-    snr: Annotated[float | None, typer.Option(help="Wanted, dB.")] = None,
+    snr: Annotated[float | None, typer.Option(help="Wanted, dB; default: 20.")] = None,
     exposure: Annotated[float | None, typer.Option(help="ms, instead of an SNR.")] = None,
     seed: Annotated[int, typer.Option(min=0, max=10**9, help="Of the noise.")] = 0,
     truth: Annotated[
@@ -78,9 +81,14 @@ def simulate(
     from squilla.camera.scenes import load_scene
     from squilla.camera.solid import solid_scene
     from squilla.camera.twin import Camera
-    from squilla.files.cube import save
+    from squilla.cli.checks import check_distance, check_file
+    from squilla.files.cube import CUBE_SUFFIXES, save
     from squilla.files.raw import write_raw
 
+    check_file(output)
+    check_distance(distance)
+    if truth is not None:
+        check_file(truth, CUBE_SUFFIXES)
     if snr is None and exposure is None:
         snr = 20.0
     twin = Camera(camera)
@@ -120,7 +128,7 @@ def calibrate(
     shots: Annotated[
         Path | None, typer.Option(help="Folder with hand-held shots of a textured plane.")
     ] = None,
-    camera: Annotated[str, typer.Option(help="thesis, or a TOML file.")] = "thesis",
+    camera: Annotated[str, typer.Option(help="A built-in design, or a TOML file.")] = "thesis",
     as_json: Json = False,
 ) -> None:
     """Learn a camera from its frames.
@@ -139,8 +147,12 @@ def calibrate(
 
     from squilla.calibration.calibrate import calibrate
     from squilla.camera.design import CameraDesign
+    from squilla.cli.checks import check_file
     from squilla.files.raw import read_raw, read_raws
 
+    check_file(output, (".nc",))
+    if target is None and shots is None and target_distance is not None:
+        raise InputError("--target-distance is the distance of the --target; give both or none.")
     design = CameraDesign.load(camera)
     steps = None if sweep is None else read_sweep(sweep)
     scenes = None if known is None else read_known(known, design.wavelength)
@@ -201,8 +213,11 @@ def reconstruct(
     squilla reconstruct night/ --calibration camera.nc --model mlp -o night.zarr
     """
     from squilla.batch import Recipe, reconstruct_one
-    from squilla.files.cube import save
+    from squilla.cli.checks import check_distance, check_file
+    from squilla.files.cube import CUBE_SUFFIXES, save
     from squilla.files.raw import list_frames
+
+    check_distance(distance)
 
     frames = [frame for path in raw for frame in list_frames(path)]
     recipe = Recipe(calibration, model, distance, depth)
@@ -214,6 +229,7 @@ def reconstruct(
             )
         _reconstruct_many(frames, recipe, output, workers, scheduler, as_json)
         return
+    check_file(output, CUBE_SUFFIXES)
     cube, extra, told = reconstruct_one(frames[0], recipe)
     save(cube, output, extra=extra)
     if as_json:
@@ -276,27 +292,32 @@ def evaluate(
 ) -> None:
     """Judge a cube against a reference.
 
-    Writes metrics.json and report.html.
+    The reference is brought onto the wavelengths of the cube. Writes metrics.json and report.html.
 
     Example: squilla evaluate cube.nc --reference truth.nc -o verdict
     """
+    from squilla.cli.checks import make_folder
     from squilla.evaluation.report import Trial, scene_section, write_report
-    from squilla.files.cube import load_cube
+    from squilla.files.cube import labelled, load_cube
     from squilla.files.disk import replacing
+    from squilla.spectra import resample
 
-    trial = Trial(cube.stem, load_cube(reference), {"cube": load_cube(cube)})
-    metrics = trial.metrics["cube"]
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"The folder {output} cannot be made: {error.strerror}.") from error
+    estimate, truth = load_cube(cube), load_cube(reference)
+    own, wanted = (each["wavelength"].values for each in (truth, estimate))
+    truth = labelled(resample(truth.values, own, wanted), wanted, attributes=truth.attrs)
+    trial = Trial(cube.stem, truth, {"cube": estimate})
+    metrics = {  # JSON knows no number for what is infinite or undefined
+        name: value if math.isfinite(value) else None
+        for name, value in trial.metrics["cube"].items()
+    }
+    make_folder(output)
     with replacing(output / "metrics.json") as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
     write_report(output / "report.html", [scene_section(trial)], title=f"{cube.name} judged")
     if as_json:
         typer.echo(json.dumps(metrics))
         return
-    for name, value in metrics.items():
+    for name, value in trial.metrics["cube"].items():
         typer.echo(f"{name:<10} {value:.6g}")
 
 
@@ -361,19 +382,19 @@ def _listed(
     return listed
 
 
-def read_depth(path: Path, shape: tuple[int, ...]):
+def read_depth(path: Path, shape: tuple[int, ...]) -> "np.ndarray":
     """Read a depth map, mm, and cut and resize it as `fitted` does the scene, (y, x) float64."""
     import numpy as np
 
-    try:
+    from squilla.files.disk import existing, reading
+
+    with reading(existing(path), "depth map"):
         if path.suffix.lower() == ".npy":
             depth = np.load(path, allow_pickle=False)
         else:
             import tifffile
 
             depth = np.asarray(tifffile.imread(path))
-    except Exception as error:  # tifffile and NumPy fail on bad bytes in many ways
-        raise InputError(f"The depth map {path} cannot be read: {error}.") from error
     if depth.ndim != 2 or depth.size == 0 or depth.dtype.kind not in "uif":
         raise InputError(f"The depth map {path} must be one picture of distances in mm.")
     if depth.shape != tuple(shape):

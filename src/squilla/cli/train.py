@@ -38,7 +38,7 @@ def train(
     learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = 1e-4,
     schedule: Annotated[str, typer.Option(help="constant or cosine.")] = "constant",
     fresh: Annotated[bool, typer.Option(help="New spectra for every epoch.")] = True,
-    seed: Annotated[int, typer.Option(help="Same seed, same weights.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=10**9, help="Same seed, same weights.")] = 0,
     device: Annotated[str | None, typer.Option(help="cpu or cuda; default: what is there.")] = None,
     precision: Annotated[str, typer.Option(help="float32, tf32 or bfloat16.")] = "float32",
     log: Annotated[Path | None, typer.Option(help="Metrics, one line of JSON per epoch.")] = None,
@@ -57,24 +57,23 @@ def train(
     On several GPUs: torchrun --nproc-per-node 4 --no-python squilla train ...
     """
     import squilla
+    from squilla.cli.checks import check_file
     from squilla.files.disk import replacing
 
-    picture = output if look is None else look
-    for file in (output, picture):  # said now, not after an hour of training
-        if not file.resolve().parent.is_dir():
-            raise InputError(f"There is no folder {file.resolve().parent}; make it first.")
-    if look is not None and look.suffix not in (".png", ".svg", ".pdf", ".webp"):
-        raise InputError(f"The picture {look} is not a .png, .svg, .pdf or .webp.")
+    check_file(output)
+    if look is not None:
+        check_file(look, (".png", ".svg", ".pdf", ".webp"))
     known = squilla.load_calibration(calibration)
 
     def draw(epoch: int, truth: "Tensor", found: "Tensor") -> None:
         from squilla.evaluation.plots import spectra_figure
 
+        assert look is not None
         names = [f"held out {number + 1}" for number in range(len(truth))]
         estimates = {f"{model}, epoch {epoch + 1}": found.numpy()}
         figure = spectra_figure(known.wavelength, truth.numpy(), estimates, names, columns=3)
-        with replacing(picture) as temporary:
-            figure.savefig(temporary, format=picture.suffix[1:])
+        with replacing(look) as temporary:
+            figure.savefig(temporary, format=look.suffix[1:].lower())
 
     trained = squilla.train(
         model,

@@ -1,10 +1,13 @@
-"""``squilla view``: look at cubes in a browser."""
+"""``squilla view`` and ``squilla live``: cubes, and a camera, in a browser."""
 
+import math
 import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from squilla.errors import InputError
 
 if TYPE_CHECKING:
     from squilla.live.server import Source
@@ -39,11 +42,12 @@ def view(
     """
     from threading import Thread
 
-    from squilla.errors import InputError
     from squilla.live.reference import read_references
     from squilla.live.server import Broken
     from squilla.live.stored import StoredCube
 
+    if not 0 <= memory < math.inf:
+        raise InputError(f"The memory must be a number of GB, 0 or more, not {memory:g}.")
     sources: list[Source] = []
     for path in cube:
         try:
@@ -84,7 +88,7 @@ def live(
     source: Annotated[str, typer.Option(help="twin, or a folder of raw frames.")] = "twin",
     model: Annotated[str, typer.Option(help="A name of `squilla models`, or a file.")] = "ridge",
     camera: Annotated[
-        str, typer.Option(help="The twin's design: thesis, or a TOML file.")
+        str, typer.Option(help="The twin's design: built-in, or a TOML file.")
     ] = "thesis",
     scene: Annotated[str, typer.Option(help="What the twin sees: a scene or a file.")] = "chart",
     distance: Annotated[
@@ -100,16 +104,20 @@ def live(
     port: Port = 8750,
     browser: Browser = True,
 ) -> None:
-    """Look through a camera: the newest frame, aligned and reconstructed, in a browser.
+    """Look through a live camera in a browser.
+
+    Shows the newest frame, aligned and reconstructed.
 
     Example: squilla live --source twin --calibration camera.nc --model ridge
     """
     from squilla.calibration.store import load_calibration
+    from squilla.cli.checks import check_distance
     from squilla.live.pipeline import LiveSource
     from squilla.live.record import Recorder
     from squilla.live.source import open_source
     from squilla.reconstruction.reconstructor import load_model
 
+    check_distance(distance)
     learnt = load_calibration(calibration)
     reconstructor = load_model(model, learnt)
     recorder = None if record is None else Recorder(record)
