@@ -15,9 +15,9 @@ import platform
 import time
 from dataclasses import asdict
 from pathlib import Path
-from statistics import median
 
 import numpy as np
+from timing import seconds
 
 from squilla.camera.twin import Camera
 from squilla.live.genicam import LiveCamera, open_camera
@@ -29,15 +29,8 @@ SHAPE = (3000, 4000)
 SECONDS = 6.0
 
 
-def milliseconds(call, repeats: int = 15) -> float:
-    """Return the median time of a call after one to warm up."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(1000 * (time.perf_counter() - start))
-    return median(times)
+def milliseconds(call) -> float:
+    return 1000 * seconds(call, 15)
 
 
 def by_numpy(data: np.ndarray) -> np.ndarray:

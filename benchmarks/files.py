@@ -6,27 +6,15 @@ Usage: python benchmarks/files.py [folder]
 import os
 import sys
 import tempfile
-import time
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 import spectral
+from timing import seconds
 
 from squilla.files.cube import labelled, load_cube, save
 from squilla.files.raw import Raw, read_raw, write_raw
 from squilla.spectra import grid
-
-
-def seconds(call, repeats=5):
-    """Return the median time of a call after one to warm up."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return median(times)
 
 
 def synced(path, write):

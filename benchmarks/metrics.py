@@ -3,26 +3,13 @@
 Usage: python benchmarks/metrics.py
 """
 
-import time
-from statistics import median
-
 import numpy as np
 import spectral
 from skimage.metrics import structural_similarity
+from timing import seconds
 
 from squilla.camera.scenes import chart_scene
 from squilla.evaluation.metrics import evaluate, sam, ssim
-
-
-def seconds(call, repeats=3):
-    """Return the median time of a call after one to warm up."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return median(times)
 
 
 def main() -> None:
@@ -46,7 +33,7 @@ def main() -> None:
     }
     print("one cube of 250 x 250 x 251; median of 3, s\n")
     for name, call in rows.items():
-        print(f"{name:32}{seconds(call):8.3f}")
+        print(f"{name:32}{seconds(call, 3):8.3f}")
 
 
 if __name__ == "__main__":

@@ -7,15 +7,13 @@ experiments/results/sparse.json.
 
 import json
 import os
-import statistics
-import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 from sklearn.linear_model import Lasso
+from timing import seconds
 
 from squilla.calibration.calibration import Calibration
 from squilla.reconstruction.sparse import Sparse, two_step
@@ -51,9 +49,9 @@ def main() -> None:
     print("| solver | us/pixel | one image, s | above the minimum, median | worst |")
     print("|---|---|---|---|---|")
     worst = float(model.heights(y.reshape(SIDE**2, -1))[1].max())
-    own = median(lambda: model(y), 5) / SIDE**2
+    own = seconds(lambda: model(y)) / SIDE**2
     row("squilla sparse", own, gap.numpy())
-    seconds = {}
+    lasso_time = {}
     for tolerance in (1e-2, 1e-4):
         found = np.empty_like(heights.numpy())
 
@@ -64,13 +62,13 @@ def main() -> None:
                     lasso = Lasso(alpha=alpha, positive=True, fit_intercept=False, tol=tolerance)
                     found[index] = lasso.fit(matrix, one).coef_
 
-        seconds[tolerance] = median(loop, 1) / SAMPLE
-        row(f"scikit-learn Lasso, tol {tolerance:g}", seconds[tolerance],
+        lasso_time[tolerance] = seconds(loop, 1) / SAMPLE
+        row(f"scikit-learn Lasso, tol {tolerance:g}", lasso_time[tolerance],
             objective(found) / lowest - 1)  # fmt: skip
     two = two_step(torch.from_numpy(matrix), pixels, ratio, 1e-2)[0].numpy()
-    time_two = median(lambda: two_step(torch.from_numpy(matrix), pixels, ratio, 1e-2), 1)
+    time_two = seconds(lambda: two_step(torch.from_numpy(matrix), pixels, ratio, 1e-2), 1)
     row("TwIST, to a gap of 1 %", time_two / SAMPLE, objective(two) / lowest - 1)
-    print(f"scikit-learn (tol 1e-4) / squilla: {seconds[1e-4] / own:.0f}")
+    print(f"scikit-learn (tol 1e-4) / squilla: {lasso_time[1e-4] / own:.0f}")
     print(f"largest relative duality gap of the image: {worst:.1e}")
     found = {
         "threads": threads,
@@ -78,28 +76,17 @@ def main() -> None:
         "atoms": len(model.atoms),
         "seconds": own * SIDE**2,
         "largest_gap": worst,
-        "scikit_learn_seconds": seconds[1e-4] * SIDE**2,
+        "scikit_learn_seconds": lasso_time[1e-4] * SIDE**2,
         "twist_seconds": time_two / SAMPLE * SIDE**2,
     }
     RESULT.write_text(json.dumps(found, indent=2) + "\n")
 
 
-def row(name: str, seconds: float, excess: np.ndarray) -> None:
+def row(name: str, each: float, excess: np.ndarray) -> None:
     print(
-        f"| {name} | {1e6 * seconds:.1f} | {seconds * SIDE**2:.2f} "
+        f"| {name} | {1e6 * each:.1f} | {each * SIDE**2:.2f} "
         f"| {np.median(excess):.1e} | {excess.max():.1e} |"
     )
-
-
-def median(function: Callable[[], object], repeats: int) -> float:
-    """Return the median time of a call after one that warms up, s."""
-    function()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 def broadband_camera() -> Calibration:

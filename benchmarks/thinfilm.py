@@ -7,11 +7,10 @@ tmm_fast is not asked for by squilla; `pip install --no-deps tmm_fast` leaves to
 
 import importlib.util
 import sys
-import time
-from statistics import median
 
 import numpy as np
 import torch
+from timing import seconds
 from tmm import coh_tmm
 
 from squilla.optics.design import together
@@ -25,14 +24,9 @@ from squilla.spectra import grid
 ANGLES = np.linspace(0, 0.28, 8)
 
 
-def seconds(call, repeats):
-    """Return the median time of a call after one to warm up, and its result."""
-    result, times = call(), []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return median(times), result
+def timed(call, repeats):
+    """Return the median time of a call and its result."""
+    return seconds(call, repeats), call()
 
 
 def main(threads: int = 1) -> None:
@@ -47,7 +41,7 @@ def main(threads: int = 1) -> None:
 
     def ours(angle, polarization, repeats):
         """The stacks as a stencil makes them: thicknesses shared, layers left out."""
-        return seconds(
+        return timed(
             lambda: transmittance(
                 index, filters.thickness.flip(-1), wavelength, layers=filters.layers.flip(-1),
                 substrate=glass, angle=angle, polarization=polarization,
@@ -68,7 +62,7 @@ def main(threads: int = 1) -> None:
         own, result = ours(angle, polarization, 30)
         print(f"{name:28s} squilla  {1e3 * own:9.2f} ms")
         for who, call, repeats in others:
-            theirs, expected = seconds(call, repeats)
+            theirs, expected = timed(call, repeats)
             difference = np.abs(result.numpy() - np.asarray(expected)).max()
             print(
                 f"{'':28s} {who:8s} {1e3 * theirs:9.2f} ms   {theirs / own:6.1f} times as long, "
@@ -106,7 +100,7 @@ def main(threads: int = 1) -> None:
             through.sum().backward()
 
         label = f"gradient, thickness {name}"
-        print(f"{label:37s} {1e3 * seconds(gradient, 20)[0]:9.2f} ms")
+        print(f"{label:37s} {1e3 * seconds(gradient, 20):9.2f} ms")
 
     print("\nwhole arrays with the back of the glass, arrays per minute")
     many = together([StencilRecipe().draw(seed) for seed in range(100)])
@@ -114,13 +108,13 @@ def main(threads: int = 1) -> None:
         ("normal incidence", 0.0, 3),
         ("8 angles, unpolarized", ANGLES, 1),
     ):
-        each, response = seconds(lambda a=angle: many.transmittance(wavelength, a), repeats)
+        each, response = timed(lambda a=angle: many.transmittance(wavelength, a), repeats)
         print(f"{name:28s} {60 * 100 / each:9.0f}")
     prior, response = Prior.draw("natural"), many.transmittance(wavelength)
-    each, _ = seconds(lambda: expected_error(response, prior, noise=WhiteNoise(20)), 3)
+    each = seconds(lambda: expected_error(response, prior, noise=WhiteNoise(20)), 3)
     print(f"{'their expected error':28s} {60 * 100 / each:9.0f}")
     faults = ProcessErrors(scale=0.01, deposition=0.01)
-    each, _ = seconds(lambda: tolerance(filters, faults, prior, noise=WhiteNoise(20), count=100), 3)
+    each = seconds(lambda: tolerance(filters, faults, prior, noise=WhiteNoise(20), count=100), 3)
     print(f"{'coated with faults, judged':28s} {60 * 100 / each:9.0f}")
 
 

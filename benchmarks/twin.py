@@ -6,27 +6,15 @@ Prints the median of five runs after one to warm up, and the peak memory of the 
 """
 
 import resource
-import time
-from statistics import median
 
 import numpy as np
 import torch
+from timing import seconds
 
 import squilla
 from squilla.calibration.rehearsal import Rehearsal
 from squilla.camera.scenes import load_scene
 from squilla.reconstruction.reconstructor import model_class
-
-
-def seconds(call, repeats: int = 5) -> float:
-    """Return the median time of a call after one to warm up."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return median(times)
 
 
 def peak() -> float:
