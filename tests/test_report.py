@@ -13,7 +13,6 @@ from squilla.errors import InputError
 from squilla.evaluation.captures import (
     alignment_figure,
     disparity_figure,
-    mosaic_figure,
     raw_figure,
 )
 from squilla.evaluation.metrics import mse
@@ -147,7 +146,7 @@ def test_raw_figure_marks_the_fields():
 
 def test_mosaic_puts_each_unit_in_its_place():
     images = np.arange(1, 7, dtype=float)[:, None, None] * np.ones((6, 8, 10)) / 6
-    mosaic = pictures(mosaic_figure(images, (2, 3)))[0]
+    mosaic = pictures(alignment_figure(images, images, (2, 3)))[0]
     assert mosaic.shape == (2 * 8 + 2, 3 * 10 + 2 * 2)
     assert mosaic[4, 4] < mosaic[4, 16] < mosaic[4, 28] < mosaic[14, 4] < mosaic[14, 28]
     np.testing.assert_array_equal(mosaic[8:10], 1)

@@ -66,23 +66,6 @@ def raw_figure(frame: np.ndarray, centres: np.ndarray, field: tuple[int, int]) -
 
 
 @styled
-def mosaic_figure(images: np.ndarray, shape: tuple[int, int]) -> "Figure":
-    """Draw the sub-images side by side as the units stand.
-
-    Parameters
-    ----------
-    images : array, (M, H, W)
-        One scale for all: a filter that lets more through is brighter.
-    shape : (int, int)
-        Rows and columns of the array.
-    """
-    mosaic = _mosaic(images, shape)
-    figure = canvas(WIDTH * 0.62, WIDTH * 0.62 * mosaic.shape[0] / mosaic.shape[1])
-    draw_picture(figure.subplots(), mosaic, vmin=0, vmax=1)
-    return figure
-
-
-@styled
 def alignment_figure(before: np.ndarray, after: np.ndarray, shape: tuple[int, int]) -> "Figure":
     """Draw the sub-images and the edges of three far units before and after alignment.
 

@@ -43,6 +43,11 @@ def pupil_cone(angle: float, f_number: float, rings: int = 4) -> tuple[np.ndarra
     -------
     angles, weights : array, (P,)
         rad; weights are cos^4 and sum to 1.
+
+    Raises
+    ------
+    InputError
+        If the F-number is not above 0.
     """
     if not f_number > 0:
         raise InputError(f"The F-number is {f_number}; it must be above 0, as 4 for an F/4 lens.")
@@ -97,6 +102,11 @@ def blue_shift(
     Returns
     -------
     array, (K', K); responses (M, K) become ``responses @ matrix.T``
+
+    Raises
+    ------
+    InputError
+        If the effective index is below 1, or `onto` reaches beyond `wavelength`.
 
     Source: the module's. What a cone on the axis has shifted and blurred already is counted once:
     the shifts left, point by point of the pupil, are those between the two cones, whose mean and

@@ -176,7 +176,10 @@ def exchange(
     generator: Generator,
     times: int = 25,
 ) -> FilterArray:
-    """Return the array with masks exchanged, each time the one that gains most of many tried."""
+    """Return the array with masks exchanged, each time the one that gains most of many tried.
+
+    times : exchanges at most; none where the recipe has no masks to choose from.
+    """
     filters = len(array.layers)
     layers = array.layers.clone()
     response = array.transmittance(wavelength)
@@ -205,7 +208,10 @@ def exchange(
 def refine(
     recipe: Recipe, array: FilterArray, merit: Merit, wavelength: np.ndarray, steps: int = 200
 ) -> tuple[FilterArray, float]:
-    """Return the array at the nearest minimum over its thicknesses, and its merit."""
+    """Return the array at the nearest minimum over its thicknesses, and its merit.
+
+    steps : of the search at most.
+    """
     from scipy.optimize import minimize
 
     least, most = (limit.expand(array.thickness.shape) for limit in recipe.limits)
