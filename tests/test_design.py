@@ -167,8 +167,8 @@ def test_design_from_the_command_line(tmp_path):
     [
         (["--recipe", "glass", "-o", "a.toml"], "no recipe"),
         (["-o", "a.csv"], "toml"),
-        (["-o", "nowhere/a.toml"], "folder that exists"),
-        (["-o", "a.toml", "--plot", "a.xls"], "cannot be drawn"),
+        (["-o", "nowhere/a.toml"], "no folder"),
+        (["-o", "a.toml", "--plot", "a.xls"], ".png, .pdf, .svg"),
         (["-o", "a.toml", "--snr", "20", "--exposure", "100"], "not both"),
         (["-o", "a.toml", "--prior", "nature"], "no prior"),
         (["-o", "a.toml", "--camera", "nobodys"], "no camera design"),

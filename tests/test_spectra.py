@@ -67,6 +67,7 @@ def test_resample_keeps_type_and_shape():
         result = resample(values, wavelength, onto)
         assert result.dtype == expected
         np.testing.assert_allclose(result[1, 2], (onto - 500) / 10, rtol=1e-6)
+        assert resample(values, wavelength, wavelength).dtype == expected
     assert resample(np.ones((4, 1)), np.array([550.0]), np.array([550.0])).shape == (4, 1)
 
 
@@ -76,6 +77,7 @@ def test_resample_keeps_type_and_shape():
         (np.ones(3), [500, 510, 520], [495, 510], "extrapolated"),
         (np.ones(3), [500, 510, 520], [510, 520.1], "extrapolated"),
         (np.ones(1), [500], [510], "extrapolated"),
+        (np.ones(3), [500, 510, 520], [505, np.nan], "extrapolated"),
         (np.ones(3), [500, 520, 510], [505], "increase"),
         (np.ones(3), [500, 510, 510], [505], "increase"),
         (np.ones(4), [500, 510, 520], [505], "4 bands but 3"),

@@ -92,6 +92,8 @@ def test_a_designs_sensor_and_its_unit_do_not_matter():
     torch.testing.assert_close(first, second)
     with pytest.raises(InputError, match="parts between 0 and 1"):
         SensorNoise(11_000, 2.5, 2.8, exposure=(0.0, 0.5))
+    with pytest.raises(InputError, match="no negative"):
+        SensorNoise(11_000, -2.5, 2.8)
 
 
 def test_gain_errors_are_factors_with_the_stated_deviation():

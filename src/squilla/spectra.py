@@ -118,13 +118,17 @@ def resample(spectrum: np.ndarray, wavelength: np.ndarray, onto: np.ndarray) -> 
     Returns
     -------
     array, (..., K'), of the type of `spectrum` (float64 for integers)
+        On its own wavelengths it is `spectrum` itself, no copy.
 
     Raises
     ------
     InputError
-        If `onto` reaches beyond `wavelength`: nothing is extrapolated.
+        If `wavelength` does not fit the spectra or does not increase, or if `onto` reaches beyond
+        it: nothing is extrapolated.
     """
     spectrum, wavelength = np.asarray(spectrum), np.asarray(wavelength, float)
+    if not np.issubdtype(spectrum.dtype, np.floating):
+        spectrum = spectrum.astype(np.float64)
     onto = np.asarray(onto, float)
     if spectrum.shape[-1] != len(wavelength):
         raise InputError(
@@ -135,15 +139,13 @@ def resample(spectrum: np.ndarray, wavelength: np.ndarray, onto: np.ndarray) -> 
     if np.array_equal(onto, wavelength):
         return spectrum
     slack = 1e-6
-    if onto.min() < wavelength[0] - slack or onto.max() > wavelength[-1] + slack:
+    if not (wavelength[0] - slack <= onto.min() and onto.max() <= wavelength[-1] + slack):
         raise InputError(
             f"The spectra cover {wavelength[0]:g}-{wavelength[-1]:g} nm, but "
             f"{onto.min():g}-{onto.max():g} nm is needed; nothing is extrapolated."
         )
     if len(wavelength) == 1:
         return np.broadcast_to(spectrum, (*spectrum.shape[:-1], len(onto))).copy()
-    if not np.issubdtype(spectrum.dtype, np.floating):
-        spectrum = spectrum.astype(np.float64)
     right = np.clip(np.searchsorted(wavelength, onto), 1, len(wavelength) - 1)
     step = wavelength[right] - wavelength[right - 1]
     weight = np.clip((onto - wavelength[right - 1]) / step, 0, 1).astype(spectrum.dtype)

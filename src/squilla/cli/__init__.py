@@ -5,7 +5,10 @@ import warnings
 
 
 def main() -> None:
-    """Run the command line; what the person can mend is said in one line, with exit code 2."""
+    """Run the command line; what the person can mend is said in one line, with exit code 2.
+
+    Interrupted, it ends with exit code 130.
+    """
     from squilla.cli.app import app
     from squilla.errors import InputError
 
@@ -15,9 +18,6 @@ def main() -> None:
     except InputError as error:
         print(f"squilla: {error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
-        print("squilla: interrupted", file=sys.stderr)
-        sys.exit(130)
 
 
 def _warn(message: Warning | str, *_: object, **__: object) -> None:

@@ -27,10 +27,12 @@ class SensorNoise:
 
     def __post_init__(self):
         low, high = self.exposure
-        if not (0 < low <= high <= 1 and self.full_well > 0 and self.gain > 0):
+        sound = self.full_well > 0 and self.gain > 0 and self.read_noise >= 0
+        if not (sound and 0 < low <= high <= 1):
             raise InputError(
-                f"A sensor of {self.full_well:g} e- and {self.gain:g} e-/DN cannot be exposed to "
-                f"{low:g}-{high:g} of its full well; give parts between 0 and 1."
+                f"A sensor of {self.full_well:g} e-, {self.gain:g} e-/DN and a read noise of "
+                f"{self.read_noise:g} e- cannot be exposed to {low:g}-{high:g} of its full well; "
+                "give parts between 0 and 1, and no negative figure."
             )
 
     @classmethod
