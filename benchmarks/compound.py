@@ -9,10 +9,10 @@ must do at last.
 
 import os
 import statistics
+import time
 from collections.abc import Callable
 
 import torch
-from timing import times
 
 from squilla.calibration.calibration import Calibration
 from squilla.optics.filters import StencilRecipe
@@ -45,8 +45,14 @@ def main() -> None:
 
 def row(name: str, function: Callable[[], object]) -> None:
     """Print the median and the least time of a call, ms."""
-    taken = [1000 * each for each in times(function, REPEATS, warm=3)]
-    print(f"| {name} | {statistics.median(taken):.0f} | {min(taken):.0f} |", flush=True)
+    for _ in range(3):
+        function()
+    times = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        function()
+        times.append(1000 * (time.perf_counter() - start))
+    print(f"| {name} | {statistics.median(times):.0f} | {min(times):.0f} |", flush=True)
 
 
 if __name__ == "__main__":
