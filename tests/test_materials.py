@@ -109,3 +109,10 @@ def test_bad_files_say_what_is_wrong(tmp_path, name, text, message):
 def test_missing_file(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         refractive_index(tmp_path / "none.csv", 550)
+
+
+def test_an_unknown_name_is_answered_with_those_like_it():
+    with pytest.raises(InputError, match=r"Did you mean TiO2/Franta\b"):
+        refractive_index("TiO2/Frantta", 550)
+    with pytest.raises(InputError, match=r"Known: .*SiO2/Malitson"):
+        refractive_index("?", 550)

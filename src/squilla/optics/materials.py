@@ -131,10 +131,10 @@ def _dispersion(material: str | Path) -> list[_Part]:
         return _shipped(str(material))
     path = Path(material)
     if path.suffix.lower() not in (".yml", ".yaml", ".csv"):
-        close = get_close_matches(str(material), materials(), 3, 0.3) or materials()
+        close = get_close_matches(str(material), materials(), 3, 0.3)
+        meant = f"Did you mean {', '.join(close)}?" if close else f"Known: {', '.join(materials())}."
         raise InputError(
-            f"There is no material {str(material)!r}. Did you mean {', '.join(close)}? "
-            "Files of your own end in .yml or .csv."
+            f"There is no material {str(material)!r}. {meant} Files of your own end in .yml or .csv."
         )
     return _read_csv(path) if path.suffix.lower() == ".csv" else _read_yaml(path)
 
