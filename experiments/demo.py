@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from machine import processor
 
 from squilla.camera.scenes import chart_layout, load_scene
 from squilla.demo import MODELS, demo
@@ -43,14 +44,6 @@ def main() -> None:
     picture(folder).savefig(PICTURE, dpi=160)
     print(table(metrics))
     print(f"\nWhole demo {machine['seconds']} s, {machine['threads']} threads, {processor()}.")
-
-
-def processor() -> str:
-    """Return what the system calls its processor."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    return f"{len(names)} x {names[0]}" if names else platform.processor() or "unknown processor"
 
 
 def table(metrics: dict) -> str:

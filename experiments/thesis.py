@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from machine import processor
 from torch import Tensor
 
 import squilla
@@ -195,12 +196,7 @@ def keep_picture(name: str, bands: np.ndarray) -> None:
 
 def machine(device: str) -> dict:
     """Return on what a number was measured."""
-    names = [
-        line.split(":")[1].strip()
-        for line in Path("/proc/cpuinfo").read_text().splitlines()
-        if line.startswith("model name")
-    ]
-    place = f"cpu, {torch.get_num_threads()} of {len(names)} x {names[0]}"
+    place = f"cpu, {torch.get_num_threads()} of {processor()}"
     if device != "cpu":
         place = torch.cuda.get_device_name(device)
     return {"device": place, "load": round(os.getloadavg()[0], 1)}

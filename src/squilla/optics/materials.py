@@ -132,7 +132,9 @@ def _dispersion(material: str | Path) -> list[_Part]:
     path = Path(material)
     if path.suffix.lower() not in (".yml", ".yaml", ".csv"):
         close = get_close_matches(str(material), materials(), 3, 0.3)
-        meant = f"Did you mean {', '.join(close)}?" if close else f"Known: {', '.join(materials())}."
+        meant = (
+            f"Did you mean {', '.join(close)}?" if close else f"Known: {', '.join(materials())}."
+        )
         raise InputError(
             f"There is no material {str(material)!r}. {meant} Files of your own end in .yml or .csv."
         )
