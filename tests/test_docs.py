@@ -15,3 +15,12 @@ def test_pages_build_without_a_warning(tmp_path):
     root = Path(__file__).parents[1]
     build(load_config(str(root / "mkdocs.yml"), site_dir=str(tmp_path / "site"), strict=True))
     assert "Calibration" in (tmp_path / "site/reference/calibration/index.html").read_text()
+
+
+def test_every_public_name_is_in_the_reference():
+    import squilla
+
+    pages = (Path(__file__).parents[1] / "docs" / "reference").glob("*.md")
+    told = "\n".join(page.read_text() for page in pages).splitlines()
+    for name, home in squilla._HOME.items():
+        assert f"::: squilla.{home}" in told, name
