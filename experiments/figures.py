@@ -5,14 +5,13 @@
 
 Figures 5.1 to 5.5 of the thesis show colours composed of the bands at 650, 550 and 500 nm, and
 spectra with the mean squared error above each, one row for each training noise; figures A.2 to A.4
-show single bands. These show the same of the twin's captures: the chart, and a solid object with
-depth where this version can make one. Drawn from whatever cells are finished; spectra come from
+show single bands. These show the same of the twin's captures: the chart, and a doll with 40 mm of
+relief, a distance found for every point. Drawn from whatever cells are finished; spectra come from
 their JSON, pictures from their weights in experiments/work. Writes docs/images/thesis_*.webp.
 """
 
 import argparse
 import json
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +74,7 @@ def main() -> None:
     for network in sorted({cell["model"] for cell in cells}):
         of_network = [cell for cell in cells if cell["model"] == network and cell["seed"] == 0]
         keep(spectra_figure(of_network, truth), f"spectra_{network}{ending}")
-    for scene in ("chart", "solid") if find_spec("squilla.camera.solid") else ("chart",):
+    for scene in ("chart", "solid"):
         seen = capture(scene)
         pictures = {}
         for noise in ROWS:
@@ -99,9 +98,8 @@ def reconstructed(cell: Cell, scene: str, seen: Capture, device: str) -> np.ndar
     weights = WORK / f"{cell.name}.safetensors"
     if not path.exists() and weights.exists():
         model = squilla.load_model(weights, one_matrix(camera())).to(device)
-        with torch.autocast(
-            device, torch.bfloat16
-        ):  # its rounding is far below what a picture shows
+        # The rounding of bfloat16 is far below what a picture shows.
+        with torch.autocast(device, torch.bfloat16):
             keep_picture(path.stem, picture(model, seen, device))
     if not path.exists():
         return None

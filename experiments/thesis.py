@@ -20,6 +20,7 @@ import squilla
 from squilla.calibration.calibration import Calibration
 from squilla.calibration.rehearsal import Rehearsal
 from squilla.camera.scenes import chart_layout, load_scene
+from squilla.camera.solid import solid_scene
 from squilla.evaluation.chart import COLOURS, inner
 from squilla.evaluation.metrics import evaluate, mse
 from squilla.files.disk import replacing
@@ -103,15 +104,13 @@ def capture(scene: str = "chart") -> Capture:
         calibration, twin = camera(), squilla.Camera("thesis")
         wavelength, size = twin.design.wavelength, twin.design.field.size
         if scene == "solid":
-            from squilla.camera.solid import solid_scene
-
             picture, depth = solid_scene(wavelength, size, distance=200.0)
             place = {"distance": 200.0, "depth": depth}
         else:
             picture, place = load_scene(scene, wavelength, size), {"distance": 300.0}
         generator = torch.Generator().manual_seed(0)
         raw = twin.capture(picture, snr=SNR, generator=generator, **place)
-        seen = squilla.measure(raw, calibration)
+        seen = squilla.measure(raw, calibration, depth="depth" in place)
         y = complete(seen.y, seen.valid, calibration, seen.angle, seen.snr)
         truth = twin.truth(picture, **place).cube.values
         with replacing(path) as temporary, open(temporary, "wb") as file:

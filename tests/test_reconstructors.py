@@ -290,6 +290,18 @@ def test_solvers_serve_cameras_of_other_bands(name, mosaic):
     assert np.isfinite(cube).all()
 
 
+def test_a_picture_of_any_camera_becomes_a_measurement():
+    """Missing values are left out; what is no picture is refused."""
+    y = torch.rand(5, 6, CAMERA.filters, generator=torch.Generator().manual_seed(0)) + 0.5
+    y[2, 3, 1] = torch.nan
+    taken = Measurement.of(y.numpy(), snr=30)
+    assert taken.valid.sum() == y.numel() - 1
+    assert not taken.valid[2, 3, 1]
+    assert np.isfinite(load_model("ridge", CAMERA).reconstruct(taken)).all()
+    with pytest.raises(InputError, match="height, width, channels"):
+        Measurement.of(y[0])
+
+
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_file_gives_the_same_network(name, tmp_path, y):
     model = model_class(name)(CAMERA).eval()

@@ -57,6 +57,29 @@ class Measurement:
     provenance: dict[str, Any] = field(default_factory=dict)
     depth: Depth | None = None
 
+    @classmethod
+    def of(cls, y: Any, *, snr: float | None = None) -> "Measurement":
+        """Take a picture whose channels lie on each other already, of any camera.
+
+        Parameters
+        ----------
+        y : array, (H, W, M)
+            In the unit of the sensitivity; NaN where there is no value.
+        snr : float, optional
+            Signal-to-noise ratio of its points over their channels, dB.
+
+        Raises
+        ------
+        InputError
+            If it is no picture.
+        """
+        y = torch.as_tensor(y, dtype=torch.float32)
+        if y.ndim != 3 or 0 in y.shape:
+            raise InputError(f"A measurement is (height, width, channels), not {tuple(y.shape)}.")
+        valid, place = y.isfinite(), torch.zeros(y.shape[:2])
+        ratio = None if snr is None else torch.full(y.shape[:2], float(snr))
+        return cls(torch.where(valid, y, 0), valid, place, place, ratio, {"alignment": "given"})
+
 
 def measure(
     raw: Raw,

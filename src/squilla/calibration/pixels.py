@@ -114,15 +114,15 @@ def _grouped(raws: Iterable[Raw]) -> dict[float, Stack]:
 def noise_of(dark: Stack, flat: Stack, lit: np.ndarray) -> tuple[float, float]:
     """Return gain (e-/DN) and read noise (e-) from how frames of the same thing vary.
 
+    Source: the photon transfer method: shot noise has the variance of its mean in electrons, so the
+    variance in DN grows with the mean by 1 / gain (Janesick, Photon Transfer).
+
     Parameters
     ----------
     dark, flat : Stack
         Of at least two frames each.
     lit : array, (rows, columns) bool
         Pixels that the flat lights evenly.
-
-    Source: the photon transfer method: shot noise has the variance of its mean in electrons, so the
-    variance in DN grows with the mean by 1 / gain (Janesick, Photon Transfer).
     """
     if dark.variance is None or flat.variance is None:
         raise InputError("Noise is learnt from repeated frames: give at least two darks and flats.")

@@ -26,6 +26,8 @@ LAMPS = ("A", "FL11", "LED-B1", "LED-B5", "D65")
 class Rehearsal:
     """Darks, flats, a narrow-band sweep and a poster, captured by the twin.
 
+    The frames are made when asked for, one by one: a sweep is larger than a memory.
+
     Parameters
     ----------
     camera : Camera
@@ -44,8 +46,6 @@ class Rehearsal:
         Share of the light of each step that is spread evenly over the band.
     distance : float
         Of the poster, mm.
-
-    The frames are made when asked for, one by one: a sweep is larger than a memory.
     """
 
     def __init__(

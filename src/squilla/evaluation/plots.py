@@ -44,14 +44,14 @@ def colour_figure(
     Above as the CIE 1931 observer sees them, below with the bands at 650, 550 and 500 nm as red,
     green and blue, gamma 2.2; all in the exposure of the truth.
 
+    Source: thesis, figures 5.1 to 5.5, for the lower row.
+
     Parameters
     ----------
     truth : DataArray, (y, x, wavelength)
     estimates : mapping of model name to DataArray, (y, x, wavelength)
     light : array, (K,), optional
         Light of the scene on the truth's wavelengths, shown white.
-
-    Source: thesis, figures 5.1 to 5.5, for the lower row.
     """
     cubes = {"truth": truth, **estimates}
     figure = sheet(2, len(cubes), truth.shape[0] / truth.shape[1])
@@ -77,6 +77,8 @@ def band_figure(
 
     Each column is scaled to the truth, so that its rows compare.
 
+    Source: thesis, figures A.2 to A.4.
+
     Parameters
     ----------
     truth : DataArray, (y, x, wavelength)
@@ -84,8 +86,6 @@ def band_figure(
     bands : sequence of float
         nm; the nearest bands are shown, those beyond the cube not. Where all are, the bands at its
         ends and in its middle.
-
-    Source: thesis, figures A.2 to A.4.
     """
     ends = _bands(truth)[[0, -1]] + (-1, 1)
     bands = [band for band in bands if ends[0] <= band <= ends[1]]
@@ -151,6 +151,8 @@ def spectra_figure(
 ) -> "Figure":
     """Draw spectra in small panels, each model's mean squared error above its panel.
 
+    Source: thesis, figures 5.1 to 5.5, for the layout and the scale of the error.
+
     Parameters
     ----------
     wavelength : array, (K,)
@@ -160,8 +162,6 @@ def spectra_figure(
     names : sequence of N str
     columns : int
         Panels beside each other.
-
-    Source: thesis, figures 5.1 to 5.5, for the layout and the scale of the error.
     """
     columns = min(columns, len(names))
     rows = -(-len(names) // columns)

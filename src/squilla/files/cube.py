@@ -16,6 +16,7 @@ from squilla.files.arrays import assemble, read_mat, read_npy, read_npz
 from squilla.files.disk import check_size, existing, reading, replacing
 from squilla.files.envi import DATA_SUFFIXES, read_envi, write_envi
 from squilla.files.lazy import DIMS
+from squilla.files.notebook import CubeAccessor
 from squilla.files.tiff import open_tiff, write_tiff
 
 CUBE_SUFFIXES = (".nc", ".hdr", ".tiff", ".tif", ".zarr")
@@ -23,6 +24,8 @@ CUBE_SUFFIXES = (".nc", ".hdr", ".tiff", ".tif", ".zarr")
 
 SCENE_SUFFIXES = (*CUBE_SUFFIXES, *DATA_SUFFIXES, ".npz", ".npy", ".mat")
 """What `read_scene` reads."""
+
+xr.register_dataarray_accessor("squilla")(CubeAccessor)
 
 _CF = {"standard_name": "radiation_wavelength", "long_name": "wavelength", "units": "nm"}
 

@@ -136,7 +136,8 @@ def _dispersion(material: str | Path) -> list[_Part]:
             f"Did you mean {', '.join(close)}?" if close else f"Known: {', '.join(materials())}."
         )
         raise InputError(
-            f"There is no material {str(material)!r}. {meant} Files of your own end in .yml or .csv."
+            f"There is no material {str(material)!r}. {meant} A file of your own ends in .yml or "
+            ".csv."
         )
     return _read_csv(path) if path.suffix.lower() == ".csv" else _read_yaml(path)
 

@@ -25,6 +25,8 @@ class Ridge(Reconstructor):
     values of the estimate are clipped to zero, which moves every spectrum nearer to the truth or
     leaves it.
 
+    Source: N. Wiener; here with the prior of spectra.broad_spectra.
+
     Parameters
     ----------
     calibration : Calibration
@@ -32,8 +34,6 @@ class Ridge(Reconstructor):
         are interpolated in between.
     moment : Tensor, (K, K), optional
         Second moment of the spectra; default: that of the broad prior.
-
-    Source: N. Wiener; here with the prior of spectra.broad_spectra.
     """
 
     name = "ridge"

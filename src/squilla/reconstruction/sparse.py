@@ -28,14 +28,14 @@ class Sparse(Reconstructor):
     too much, with equal ||R psi|| narrow ones. Rule and heights were chosen on random natural,
     Gaussian and line spectra at 15 to 40 dB.
 
+    Source: thesis, section on sparse recovery.
+
     Parameters
     ----------
     calibration : Calibration
     tolerance : float
         Largest relative duality gap: the objective of each pixel is within this fraction of the
         minimum.
-
-    Source: thesis, section on sparse recovery.
     """
 
     name = "sparse"
