@@ -1,5 +1,7 @@
 """The linear (Wiener) estimator, and the filling of invalid channels, which is the same algebra."""
 
+from collections.abc import Sequence
+from copy import copy
 from functools import lru_cache
 
 import numpy as np
@@ -52,6 +54,12 @@ class Ridge(Reconstructor):
         self.register_buffer("basis", basis.float(), persistent=False)
         self.register_buffer("power", power.clamp_min(0).float(), persistent=False)
         self.register_buffer("gain", (basis.mT @ response @ moment).float(), persistent=False)
+
+    def only(self, bands: Sequence[int]) -> "Ridge":
+        some = copy(self)
+        some._buffers = self._buffers | {"gain": self.gain[..., list(bands)].contiguous()}
+        some.wavelength = np.asarray(self.wavelength)[list(bands)]
+        return some
 
     def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None) -> Tensor:
         noise = _noise_to_signal(snr, len(y), y.device)[:, None]
