@@ -117,12 +117,15 @@ def live(
 
     Example: squilla live --source genicam --calibration camera.nc
     """
+    import torch
+
     from squilla.calibration.store import load_calibration
-    from squilla.live.pipeline import LiveSource
+    from squilla.live.pipeline import LiveSource, half_of_the_cores
     from squilla.live.record import Recorder
     from squilla.live.source import open_source
     from squilla.reconstruction.reconstructor import load_model
 
+    torch.set_num_threads(half_of_the_cores())
     learnt = load_calibration(calibration)
     reconstructor = load_model(model, learnt)
     recorder = None if record is None else Recorder(record)

@@ -1,7 +1,7 @@
 """One live frame: measured, and of its cube only what somebody looks at."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -13,43 +13,43 @@ from squilla.calibration.alignment import Measurement
 from squilla.live.answer import Answers
 from squilla.reconstruction.reconstructor import Reconstructor
 
-_LARGE = 0.2
-"""Share of the picture from which on a region's spectra are worth the whole cube."""
-
-
-class Decoder:
-    """Reconstructs some bands of all pixels, or all bands of some, where the model can.
+class Look:
+    """Works out of a measurement what is asked for: some bands, some spectra, or the whole cube.
 
     Parameters
     ----------
     model : Reconstructor
+        One that cannot do with less makes the cube, once.
+    measurement : Measurement
     """
 
-    def __init__(self, model: Reconstructor):
-        self.model = model
-        self.selective = model.only([0]) is not None
-        self._last: tuple[Sequence[int], Reconstructor] | None = None
+    def __init__(self, model: Reconstructor, measurement: Measurement):
+        self._model, self._measurement = model, measurement
+        self._cube: DataArray | None = None
 
-    def bands(self, measurement: Measurement, bands: Sequence[int]) -> np.ndarray:
+    def cube(self) -> DataArray:
+        """Return all spectra of all pixels."""
+        if self._cube is None:
+            self._cube = self._model.reconstruct(self._measurement)
+        return self._cube
+
+    def bands(self, numbers: list[int]) -> np.ndarray:
         """Return some bands of all pixels, (H, W, bands)."""
-        last = self._last
-        if last is None or last[0] != bands:
-            some = self.model.only(bands)
-            assert some is not None
-            self._last = last = (bands, some)
-        return last[1].reconstruct(measurement).values
+        some = None if self._cube is not None else self._model.only(numbers)
+        if some is None:
+            return self.cube().values[..., numbers]
+        return some.reconstruct(self._measurement).values
 
-    def pixels(self, measurement: Measurement, rows: slice, columns: slice) -> np.ndarray:
+    def spectra(self, rows: slice, columns: slice) -> np.ndarray:
         """Return all bands of some pixels, (h, w, K)."""
+        if self._cube is not None or self._model.only([0]) is None:
+            return self.cube().values[rows, columns]
         part = {
-            name: None if (whole := getattr(measurement, name)) is None else whole[rows, columns]
+            name: None if (whole := getattr(self._measurement, name)) is None else whole[place]
             for name in ("y", "valid", "angle", "disparity", "snr")
+            for place in [(rows, columns)]
         }
-        return self.model.reconstruct(replace(measurement, **part)).values
-
-    def cube(self, measurement: Measurement) -> DataArray:
-        """Return all of the cube."""
-        return self.model.reconstruct(measurement)
+        return self._model.reconstruct(replace(self._measurement, **part)).values
 
 
 class LiveFrame(Answers):
@@ -60,32 +60,32 @@ class LiveFrame(Answers):
     number : int
         Of the frame, increasing.
     measurement : Measurement
-    decoder : Decoder
+    model : Reconstructor
     told : dict
         What the page shows of the frame; the time of reconstruction is added.
     before : LiveFrame, optional
         What was asked of the frame before is expected to be asked of this one too.
     """
 
+    few_bands = True
+
     def __init__(
         self,
         number: int,
         measurement: Measurement,
-        decoder: Decoder,
+        model: Reconstructor,
         told: dict[str, Any],
         before: "LiveFrame | None" = None,
     ):
-        model = decoder.model
         valid = DataArray(measurement.valid.all(-1).numpy(), dims=("y", "x"))
         rows, columns, _ = measurement.y.shape
         super().__init__("live", (rows, columns), np.asarray(model.wavelength), {"valid": valid})
-        self.number, self.few_bands = number, decoder.selective
-        self._measurement, self._decoder, self._told = measurement, decoder, told
+        self.number, self._told = number, told
+        self._look = Look(model, measurement)
         self._expected = [] if before is None else before._asked or before._expected
         self._asked: list[int] = []
         self._places: dict[int, tuple[int, int]] = {}  # of each decoded band
         self._planes: list[np.ndarray] = []
-        self._held: list[DataArray] = []  # the cube, once worked out
 
     def status(self) -> dict[str, Any]:
         """Return exposure, saturation, alignment, the times of the stages."""
@@ -100,30 +100,22 @@ class LiveFrame(Answers):
     def cube(self) -> DataArray:
         """Return the whole reconstruction; worked out once."""
         with self._lock:
-            if not self._held:
-                self._held.append(self._timed(self._decoder.cube))
-            return self._held[0]
+            return self._timed(self._look.cube)
 
     def blocks(
         self, rows: slice, columns: slice, bands: slice = slice(None)
     ) -> Iterator[np.ndarray]:
         """Give a part of the cube in one piece."""
-        wanted = range(len(self.wavelength))[bands]
-        share = len(range(self.shape[0])[rows]) * len(range(self.shape[1])[columns])
-        share /= self.shape[0] * self.shape[1]
-        if self._held or not self._decoder.selective:
-            yield self.cube().values[rows, columns, bands]
-        elif len(wanted) < len(self.wavelength):
-            yield self._decoded(list(wanted))[rows, columns]
-        elif share < _LARGE:
-            yield self._timed(self._decoder.pixels, rows, columns)
+        wanted = list(range(len(self.wavelength))[bands])
+        if len(wanted) < len(self.wavelength):
+            yield self._decoded(wanted)[rows, columns]
         else:
-            yield self.cube().values[rows, columns, bands]
+            with self._lock:
+                found = self._timed(self._look.spectra, rows, columns)
+            yield found
 
     def plane(self, band: int, rows: slice, columns: slice) -> np.ndarray:
         """Return a part of one band."""
-        if self._held or not self._decoder.selective:
-            return self.cube().values[rows, columns, band]
         return self._decoded([band])[rows, columns, 0]
 
     def _decoded(self, bands: list[int]) -> np.ndarray:
@@ -136,7 +128,7 @@ class LiveFrame(Answers):
                     for band in dict.fromkeys(self._expected + bands)
                     if band not in self._places
                 ]
-                self._planes.append(self._timed(self._decoder.bands, new))
+                self._planes.append(self._timed(self._look.bands, new))
                 group = len(self._planes) - 1
                 self._places |= {band: (group, at) for at, band in enumerate(new)}
             places = [self._places[band] for band in bands]
@@ -145,9 +137,9 @@ class LiveFrame(Answers):
             return self._planes[group][..., first : last + 1]
         return np.stack([self._planes[group][..., at] for group, at in places], -1)
 
-    def _timed(self, call, *arguments) -> Any:
+    def _timed(self, call: Callable, *arguments: Any) -> Any:
         start = time.perf_counter()
-        found = call(self._measurement, *arguments)
+        found = call(*arguments)
         stages = self._told["stages"]
         stages["decode"] = stages.get("decode", 0.0) + 1000 * (time.perf_counter() - start)
         return found

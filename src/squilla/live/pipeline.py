@@ -7,6 +7,7 @@ import warnings
 from collections import deque
 from typing import Any
 
+import numba
 import numpy as np
 
 from squilla.calibration.alignment import Measurement, measure
@@ -15,7 +16,7 @@ from squilla.errors import InputError
 from squilla.files.raw import Raw
 from squilla.live.answer import spectral_colours
 from squilla.live.exposure import better_exposure
-from squilla.live.frame import Decoder, LiveFrame
+from squilla.live.frame import LiveFrame
 from squilla.live.record import Recorder
 from squilla.live.source import FrameSource, say
 from squilla.reconstruction.reconstructor import Reconstructor
@@ -28,6 +29,14 @@ _REPEAT = 10.0
 
 _PATIENCE = 60.0
 """Seconds for which a page waits for the first frame: on a new machine code is compiled before."""
+
+
+def half_of_the_cores() -> int:
+    """Return the threads for each of the two things that go on at once: measuring and decoding.
+
+    Where both wanted all cores, each would wait for the other's threads to get their turn.
+    """
+    return max(1, numba.config.NUMBA_NUM_THREADS // 2)  # pyright: ignore
 
 
 class LiveSource:
@@ -64,7 +73,7 @@ class LiveSource:
         source.check_size(calibration.pixels.bias.shape)
         source.report = self._heard
         self._source, self._calibration, self._pixels = source, calibration, calibration.pixels
-        self._decoder, self._before = Decoder(model), None
+        self._model, self._before = model, None
         self._title, self._recorder, self._distance = title, recorder, distance
         self._frame: LiveFrame | None = None
         self._trouble: str | None = None
@@ -98,7 +107,7 @@ class LiveSource:
             "exposures": self._source.exposures,
             "gains": self._source.gains,
             "records": self._recorder is not None,
-            "facts": {"model": self._decoder.model.name},
+            "facts": {"model": self._model.name},
             "layers": [
                 {
                     "name": "valid", "label": "valid", "unit": "",
@@ -151,6 +160,7 @@ class LiveSource:
     # --- the thread -----------------------------------------------------------------------------
 
     def _run(self) -> None:
+        numba.set_num_threads(half_of_the_cores())  # of this thread alone
         while not self._ended.is_set():
             try:
                 start = time.perf_counter()
@@ -207,7 +217,7 @@ class LiveSource:
             "stages": {"frame": 1000 * taken, "measure": 1000 * spent},
         }
         self._number += 1
-        frame = LiveFrame(self._number, measurement, self._decoder, told, self._frame)
+        frame = LiveFrame(self._number, measurement, self._model, told, self._frame)
         if self._recorder is not None and self._recorder.running:
             self._recorder.offer(raw, frame.cube)
         self._frame = frame

@@ -134,7 +134,7 @@ class Reconstructor(nn.Module):
         return torch.cat(parts).reshape(*pixels, len(self.wavelength))
 
     def _piece(self, y: Tensor, angle: Tensor | None, snr: Tensor | None, scale: Scale) -> Tensor:
-        finite = y.isfinite().all(-1, keepdim=True)
+        finite = y.sum(-1, keepdim=True).isfinite()
         y = torch.where(finite, y, 0)
         peak = y.amax(-1, keepdim=True)
         lit = peak > 0
