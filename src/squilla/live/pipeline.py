@@ -238,6 +238,7 @@ class LiveSource:
             "dropped": counts.skipped + counts.lost,
             "incomplete": counts.incomplete,
             "exposure": raw.exposure,
+            "taken": raw.metadata.get("frame"),
             "saturated": float(np.mean(few >= self._pixels.saturation)),
             "error": None,
         }
