@@ -115,16 +115,22 @@ def test_what_was_asked_of_a_frame_is_expected_of_the_next(live, monkeypatch):
     assert fourth._places.keys() == {5, 9}, "what nobody asks for any more is left"
 
 
+def reads(source: LiveSource, count: int) -> None:
+    """Wait until so many more frames were taken off the camera; what was under way is then shown."""
+    before = source._source.statistics.delivered
+    until(lambda: source._source.statistics.delivered >= before + count)
+
+
 def test_freeze_and_step(live):
     until(lambda: live.now().number >= 3)
     live.control("frozen", True)
-    time.sleep(0.2)  # what was under way arrives
+    reads(live, 2)
     number = live.now().number
-    time.sleep(0.3)
+    reads(live, 10)
     assert live.now().number == number
     live.control("step", None)
     until(lambda: live.now().number == number + 1)
-    time.sleep(0.3)
+    reads(live, 10)
     assert live.now().number == number + 1
     live.control("frozen", False)
     until(lambda: live.now().number > number + 2)
@@ -133,9 +139,10 @@ def test_freeze_and_step(live):
 def test_nobody_looking_nothing_is_measured(live, monkeypatch):
     monkeypatch.setattr("squilla.live.pipeline._ATTENTION", 0.1)
     until(lambda: live.now().number >= 2)
-    time.sleep(0.5)
+    until(lambda: time.monotonic() - live._looked > 0.1)
+    reads(live, 2)
     number = live._frame.number
-    time.sleep(0.3)
+    reads(live, 10)
     assert live._frame.number == number
     until(lambda: live.now().number > number)
 
@@ -356,7 +363,7 @@ def test_the_page_shows_the_twin_alive(camera, scene, calibration, tmp_path):
     with running(source) as address, Browser() as browser:
         page = browser.page()
         page.open(f"http://{address}/")
-        page.wait("performance.getEntriesByName('squilla first picture').length > 0", 30)
+        page.wait("performance.getEntriesByName('squilla first picture').length > 0", 120)
         page.click("#picture")
         value = "document.querySelector('#spectra td.number').innerText"
         first = page.wait(f"({value}).replace('…', '')")
@@ -369,10 +376,18 @@ def test_the_page_shows_the_twin_alive(camera, scene, calibration, tmp_path):
         page.wait("document.querySelector('#recorded').innerText.includes('recorded')")
         page.click("#freeze")
         page.wait("document.querySelector('#freeze').getAttribute('aria-pressed') == 'true'")
-        time.sleep(0.5)
+        reads(source, 2)
+        page.wait(f"document.querySelector('#live').dataset.frame == {source._frame.number}")
         still = page.js(value)
-        time.sleep(0.5)
+        reads(source, 10)
         assert page.js(value) == still
+        page.click("#step")
+        page.wait(f"{value} != '{still}'")
+        page.click("#automatic")
+        until(lambda: source._automatic)
+        page.js("(e => { e.value = 3; e.dispatchEvent(new Event('change')); })"
+                "(document.querySelector('#gain'))")  # fmt: skip
+        until(lambda: twin.gain == 3)
         assert "/s" in str(page.js("document.querySelector('#facts').innerText"))
         assert page.complaints() == []
     source.close()

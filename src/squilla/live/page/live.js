@@ -98,6 +98,7 @@ export class Live {
     const spectra = this.answers.get(this.pictures.length);
     if (spectra) this.take(spectra);
     this.answers.clear();
+    $("live").dataset.frame = header.frame;
   }
 
   take({ header, values }) {
