@@ -35,7 +35,7 @@ from squilla.calibration.views import evened, sub_images
 from squilla.camera.twin import Camera
 from squilla.files.raw import Raw
 from squilla.live.frame import Look
-from squilla.live.pipeline import LiveSource, half_of_the_cores
+from squilla.live.pipeline import LiveSource
 from squilla.live.source import Counts, MovingTwin
 from squilla.live.twin_camera import camera_within
 from squilla.live.twin_frames import TwinFrames, views
@@ -200,7 +200,7 @@ def main() -> None:
     results = {"machine": machine, "load_before": os.getloadavg()[0]}
     print(f"{machine}, load {os.getloadavg()[0]:.1f}\n\n| step | ms | CPU ms |\n|---|---|---|")
     results["steps"] = stages(calibration, raws, models)
-    torch.set_num_threads(half_of_the_cores())
+    torch.set_num_threads(max(1, torch.get_num_threads() // 2))  # as `squilla live` does
     print("\n| source, model | frames/s | read | measure | decode | answer | send | page |")
     print("|" + "---|" * 8)
     results["live"] = {}

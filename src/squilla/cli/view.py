@@ -120,12 +120,13 @@ def live(
     import torch
 
     from squilla.calibration.store import load_calibration
-    from squilla.live.pipeline import LiveSource, half_of_the_cores
+    from squilla.live.pipeline import LiveSource
     from squilla.live.record import Recorder
     from squilla.live.source import open_source
     from squilla.reconstruction.reconstructor import load_model
 
-    torch.set_num_threads(half_of_the_cores())
+    # A frame is measured while another is reconstructed; threads that wait for cores waste them.
+    torch.set_num_threads(max(1, torch.get_num_threads() // 2))
     learnt = load_calibration(calibration)
     reconstructor = load_model(model, learnt)
     recorder = None if record is None else Recorder(record)

@@ -7,7 +7,6 @@ import warnings
 from collections import deque
 from typing import Any
 
-import numba
 import numpy as np
 
 from squilla.calibration.alignment import Measurement, measure
@@ -29,14 +28,6 @@ _REPEAT = 10.0
 
 _PATIENCE = 60.0
 """Seconds for which a page waits for the first frame: on a new machine code is compiled before."""
-
-
-def half_of_the_cores() -> int:
-    """Return the threads for each of the two things that go on at once: measuring and decoding.
-
-    Where both wanted all cores, each would wait for the other's threads to get their turn.
-    """
-    return max(1, numba.config.NUMBA_NUM_THREADS // 2)  # pyright: ignore
 
 
 class LiveSource:
@@ -160,7 +151,6 @@ class LiveSource:
     # --- the thread -----------------------------------------------------------------------------
 
     def _run(self) -> None:
-        numba.set_num_threads(half_of_the_cores())  # of this thread alone
         while not self._ended.is_set():
             try:
                 start = time.perf_counter()
