@@ -1,10 +1,13 @@
 """Time the way from a live camera to numbers: unpacking, the twin's frames, and both together.
 
-    python benchmarks/camera.py [-o experiments/results/camera.json]
+    python benchmarks/camera.py [--faults] [-o experiments/results/camera.json]
 
-Unpacking stands beside NumPy. Frames of 12 megapixels go from the twin to a client in another
+Unpacking stands beside NumPy. Frames of 1 and 12 megapixels go from the twin to a client in another
 process over 127.0.0.1, and within one process through the simulated device of libaravis. Times are
 medians after warm-up; the load of the machine is printed, for others may be at work on it.
+
+With --faults instead: a minute with 5 % of the packets lost, and how long a stream takes to go on
+after its camera was killed and started again.
 """
 
 import argparse
@@ -12,6 +15,7 @@ import json
 import multiprocessing
 import os
 import platform
+import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +23,11 @@ from pathlib import Path
 import numpy as np
 from timing import seconds
 
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+import twin_process
 from squilla.camera.twin import Camera
+from squilla.live.connection import Region
 from squilla.live.genicam import LiveCamera, open_camera
 from squilla.live.pixel_format import FORMATS
 from squilla.live.twin_camera import TwinCamera, camera_within
@@ -27,6 +35,7 @@ from squilla.live.twin_frames import TwinFrames
 
 SHAPE = (3000, 4000)
 SECONDS = 6.0
+HERE = "genicam:127.0.0.1"
 
 
 def milliseconds(call) -> float:
@@ -70,8 +79,9 @@ def drawing(frames: TwinFrames) -> dict[str, float]:
     }
 
 
-def serve(pipe, rate: float) -> None:
-    with TwinCamera(frames_of(Camera("thesis")), rate=rate) as twin:
+def serve(pipe, rate: float, small: bool) -> None:
+    frames = twin_process.megapixel_frames() if small else frames_of(Camera("thesis"))
+    with TwinCamera(frames, rate=rate) as twin:
         pipe.send(True)
         pipe.recv()
         pipe.send(twin.sent)
@@ -89,12 +99,12 @@ def watch(camera: LiveCamera) -> dict[str, float]:
     return {"frames_per_s": rate, **asdict(counts)}
 
 
-def over_loopback(name: str, rate: float) -> dict[str, float]:
+def over_loopback(name: str, rate: float, small: bool = False) -> dict[str, float]:
     ours, theirs = multiprocessing.Pipe()
-    process = multiprocessing.Process(target=serve, args=(theirs, rate))
+    process = multiprocessing.Process(target=serve, args=(theirs, rate, small))
     process.start()
     ours.recv()
-    with open_camera("genicam:127.0.0.1", pixel_format=name) as camera:
+    with open_camera(HERE, pixel_format=name) as camera:
         camera.exposure = 1.0
         seen = watch(camera)
     ours.send(None)
@@ -109,20 +119,68 @@ def in_process(frames: TwinFrames) -> dict[str, float]:
         return watch(camera)
 
 
+def lossy(seconds: float = 60.0) -> dict[str, float]:
+    """Read from a camera of which 5 % of the packets get lost; whole frames are as they were sent."""
+    frames = twin_process.megapixel_frames()
+    with TwinCamera(frames, rate=25.0, lost=0.05) as twin, open_camera(HERE) as camera:
+        camera.region = Region(100, 1000)  # 19 packets of data: one frame in three is whole
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            raw = camera.read()
+            facts = raw.metadata
+            sent = frames.draw(facts["frame"], raw.exposure, facts["gain"], camera.region)
+            assert np.array_equal(raw.frame, sent)
+        camera.close()
+        return {"seconds": seconds, "sent": twin.sent, **asdict(camera.statistics)}
+
+
+def restarted() -> float:
+    """Return the seconds from the start of a camera that was killed to its next frame."""
+    process, pipe = twin_process.start()
+    with open_camera(HERE) as camera:
+        camera.read()
+        process.kill()
+        process.join()
+        process, pipe = twin_process.start()  # answers already
+        begin = time.monotonic()
+        while camera.statistics.reconnected == 0:
+            camera.read()
+        seconds = time.monotonic() - begin
+    process.kill()
+    process.join()
+    pipe.close()
+    return seconds
+
+
+def faults() -> dict:
+    return {"lost_packets": lossy(), "restart_seconds": [restarted() for _ in range(3)]}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path)
-    output = parser.parse_args().output
+    parser.add_argument("--faults", action="store_true")
+    given = parser.parse_args()
+    output = given.output
+    before = json.loads(output.read_text()) if output and output.exists() else {}
+    if given.faults:
+        found = {"faults": faults() | {"load": os.getloadavg()[0]}}
+        print(json.dumps(found, indent=2))
+        if output is not None:
+            output.write_text(json.dumps(before | found, indent=2) + "\n")
+        return
     frames = frames_of(Camera("thesis"))
-    results = {
+    results = before | {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "threads": os.environ.get("NUMBA_NUM_THREADS", "default"),
         "load_before": os.getloadavg()[0],
         "milliseconds": unpacking() | drawing(frames),
         "live": {
-            "loopback Mono12p": over_loopback("Mono12p", 100.0),
-            "loopback Mono12": over_loopback("Mono12", 100.0),
-            "in process Mono12p": in_process(frames),
+            "1 MP loopback Mono12p, 20 sent": over_loopback("Mono12p", 20.0, small=True),
+            "1 MP loopback Mono12p, 100 sent": over_loopback("Mono12p", 100.0, small=True),
+            "12 MP loopback Mono12p, 2 sent": over_loopback("Mono12p", 2.0),
+            "12 MP loopback Mono12p, 100 sent": over_loopback("Mono12p", 100.0),
+            "12 MP in process Mono12p, 100 sent": in_process(frames),
         },
         "load_after": os.getloadavg()[0],
     }

@@ -121,7 +121,7 @@ class Page:
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
-    def wait(self, expression: str, seconds: float = 10.0) -> object:
+    def wait(self, expression: str, seconds: float = 60.0) -> object:
         """Wait until an expression is true, and return its value."""
         end = time.monotonic() + seconds
         while not (value := self.js(expression)):

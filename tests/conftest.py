@@ -1,5 +1,9 @@
 """A small camera for the tests: everything the thesis' camera has, on a hundredth of the pixels."""
 
+import fcntl
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -52,6 +56,14 @@ def scene(design):
     texture = poster(90, design.wavelength, seed=3)
     tint = np.linspace(0.4, 1, len(design.wavelength))
     return (texture * tint).astype(np.float32)
+
+
+@pytest.fixture
+def port():
+    """Lend the one port of GigE Vision: tests in other processes wait."""
+    with (Path(tempfile.gettempdir()) / "squilla-gige-vision.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 @pytest.fixture

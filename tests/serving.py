@@ -63,7 +63,7 @@ class Line:
 
     def receive(self) -> tuple[dict, np.ndarray | None]:
         """Wait for the next answer."""
-        return unpack(self.socket.recv(timeout=10))
+        return unpack(self.socket.recv(timeout=60))
 
     def tell(self, text: str | bytes) -> tuple[dict, np.ndarray | None]:
         """Send anything, and return what comes next."""

@@ -164,7 +164,7 @@ def test_a_camera_that_stays_away():
 def test_what_is_set_while_a_camera_is_away_is_set_when_it_is_back():
     first, second = Scripted([CameraLost("Gone.")]), Scripted([1])
     camera = opened(first, second, patience=5)
-    camera._report = lambda said: setattr(camera, "exposure", 44.0) if "Gone" in said else None
+    camera.report = lambda said: setattr(camera, "exposure", 44.0) if "Gone" in said else None
     assert camera.read().exposure == 44.0
     assert first.exposure == 10.0
 

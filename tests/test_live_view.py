@@ -1,5 +1,6 @@
 """The live view: the newest frame, right numbers, wishes to the camera, recording."""
 
+import errno
 import json
 import time
 from collections.abc import Iterator
@@ -10,15 +11,21 @@ import torch
 import xarray as xr
 
 from browser import MISSING, Browser, find
+from conftest import small_design
 from serving import Line, running
 from squilla.calibration.alignment import measure
+from squilla.camera.twin import Camera
 from squilla.errors import InputError
+from squilla.evaluation.metrics import sam
 from squilla.files.raw import Raw, read_raws, write_raw
+from squilla.live.answer import colour_bands
+from squilla.live.frame import LiveFrame
 from squilla.live.pipeline import LiveSource
 from squilla.live.protocol import Picture, Spectra
 from squilla.live.record import Recorder
 from squilla.live.source import Counts, FolderFrames, MovingTwin, open_source
 from squilla.reconstruction.reconstructor import load_model
+from squilla.spectra import rgb_weights
 
 
 class Stack:
@@ -27,7 +34,10 @@ class Stack:
     def __init__(self, frames: list[Raw]):
         self.frames, self.statistics = frames, Counts()
         self.exposure: float | None = frames[0].exposure
-        self.held = 0
+        self.gain, self.exposures, self.gains = 0.0, (0.01, 1000.0), (0.0, 24.0)
+
+    def check_size(self, shape) -> None:
+        pass
 
     def read(self, *, timeout: float = 5.0) -> Raw:
         time.sleep(0.01)
@@ -64,29 +74,63 @@ def until(test, seconds: float = 20.0):
 
 
 def test_a_live_frame_is_what_measuring_and_reconstructing_give(live, frames, calibration):
-    frame = until(lambda: (now := live.now()).number >= 3 and now)
-    cube = load_model("ridge", calibration).reconstruct(measure(frames[-1], calibration)).values
+    """From the frame before the places are found as well as without; bands and pixels alone are
+    what they are in the whole cube."""
+    frame = until(lambda: (now := live.now()).number >= 4 and now)
+    model, measured = load_model("ridge", calibration), measure(frames[-1], calibration)
+    cube = model.reconstruct(measured).values
     picture, _ = frame.picture(Picture(kind="band", band=7))
+    assert np.sqrt(np.mean((picture[0] - cube[..., 7]) ** 2)) < 1e-3 * cube[..., 7].mean()
+    cube = model.reconstruct(frame._look._measurement).values
     np.testing.assert_allclose(picture[0], cube[..., 7], rtol=1e-5)
-    (mean, _), _ = frame.spectra(Spectra(regions=[(10, 20, 11, 21)]))
+    (mean, spread), _ = frame.spectra(Spectra(regions=[(10, 20, 11, 21), (30, 30, 40, 36)]))
     np.testing.assert_allclose(mean[0], cube[10, 20], rtol=1e-5)
+    np.testing.assert_allclose(mean[1], cube[30:40, 30:36].mean((0, 1)), rtol=1e-5)
+    np.testing.assert_allclose(spread[1], cube[30:40, 30:36].std((0, 1)), rtol=1e-3, atol=1e-5)
+    assert frame._look._cube is None, "nobody asked for the whole cube"
+    colour, _ = frame.picture(Picture(kind="colour"))
+    bands = colour_bands(51)
+    expected = np.moveaxis(cube[..., bands] @ rgb_weights(model.wavelength[bands]), -1, 0)
+    np.testing.assert_allclose(colour, expected, rtol=1e-3, atol=1e-5 * expected.max())
+    angle, _ = frame.picture(Picture(kind="angle", spectrum=cube[10, 20].tolist()))
+    np.testing.assert_allclose(angle[0], sam(cube, cube[10, 20]), atol=1e-3)
     told = frame.status()
     assert told["exposure"] == frames[-1].exposure
     assert told["distance"] == pytest.approx(300, rel=0.1)
     assert told["saturated"] == 0
-    assert {"frame", "measure", "reconstruct"} <= told["stages"].keys()
+    assert {"frame", "measure", "decode"} <= told["stages"].keys()
+
+
+def test_what_was_asked_of_a_frame_is_expected_of_the_next(live, monkeypatch):
+    first = live.now()
+    first.picture(Picture(kind="band", band=3))
+    first.picture(Picture(kind="band", band=9))
+    second = LiveFrame(99, first._look._measurement, first._look._model, {"stages": {}}, first)
+    second.picture(Picture(kind="band", band=9))
+    assert second._places.keys() == {3, 9}
+    third = LiveFrame(100, first._look._measurement, first._look._model, {"stages": {}}, second)
+    third.picture(Picture(kind="band", band=9))
+    fourth = LiveFrame(101, first._look._measurement, first._look._model, {"stages": {}}, third)
+    fourth.picture(Picture(kind="band", band=5))
+    assert fourth._places.keys() == {5, 9}, "what nobody asks for any more is left"
+
+
+def reads(source: LiveSource, count: int) -> None:
+    """Wait until so many more frames were taken off the camera; what was under way is then shown."""
+    before = source._source.statistics.delivered
+    until(lambda: source._source.statistics.delivered >= before + count)
 
 
 def test_freeze_and_step(live):
     until(lambda: live.now().number >= 3)
     live.control("frozen", True)
-    time.sleep(0.2)  # what was under way arrives
+    reads(live, 2)
     number = live.now().number
-    time.sleep(0.3)
+    reads(live, 10)
     assert live.now().number == number
     live.control("step", None)
     until(lambda: live.now().number == number + 1)
-    time.sleep(0.3)
+    reads(live, 10)
     assert live.now().number == number + 1
     live.control("frozen", False)
     until(lambda: live.now().number > number + 2)
@@ -95,9 +139,10 @@ def test_freeze_and_step(live):
 def test_nobody_looking_nothing_is_measured(live, monkeypatch):
     monkeypatch.setattr("squilla.live.pipeline._ATTENTION", 0.1)
     until(lambda: live.now().number >= 2)
-    time.sleep(0.5)
+    until(lambda: time.monotonic() - live._looked > 0.1)
+    reads(live, 2)
     number = live._frame.number
-    time.sleep(0.3)
+    reads(live, 10)
     assert live._frame.number == number
     until(lambda: live.now().number > number)
 
@@ -115,11 +160,97 @@ def test_trouble_is_told_and_passes(frames, calibration):
 
 def test_wishes(live):
     assert live.control("exposure", 3.5)["exposure"] == 3.5
-    for value in (None, True):
-        with pytest.raises(InputError, match="number of ms"):
-            live.control("exposure", value)
+    assert live.control("gain", 6.0)["gain"] == 6.0
+    for name in ("exposure", "gain"):
+        for value in (None, True):
+            with pytest.raises(InputError, match="must be a number"):
+                live.control(name, value)
     with pytest.raises(InputError, match="--record"):
         live.control("recording", True)
+
+
+@pytest.mark.parametrize("wrong", [0.02, 30.0])
+def test_automatic_exposure_brings_the_light_where_it_belongs(camera, scene, calibration, wrong):
+    """From far too short or far too long, within a few frames; a hand at the dial ends it."""
+    twin = MovingTwin(camera, scene, rate=50)
+    good = twin.exposure
+    twin.exposure = wrong * good
+    source = LiveSource(twin, calibration, load_model("ridge", calibration))
+    source.control("automatic", True)
+    until(lambda: twin.exposure == pytest.approx(good, rel=0.25))
+    until(lambda: source._frame and source.now().status()["error"] is None)
+    until(lambda: source.now().status()["exposure"] == twin.exposure)
+    assert source.now().status()["saturated"] < 0.01
+    told = source.control("exposure", good / 2)
+    assert (told["automatic"], told["exposure"]) == (False, good / 2)
+    source.close()
+
+
+def test_frames_of_another_size_are_refused(frames, camera, calibration, tmp_path):
+    small = Raw(frames[0].frame[:400, :400], 1.0, {})
+    write_raw(tmp_path / "small.tiff", small)
+    model = load_model("ridge", calibration)
+    for source in (FolderFrames(tmp_path), MovingTwin(Camera(small_design(field={"size": 40})))):
+        shape = (9, 9) if isinstance(source, MovingTwin) else calibration.pixels.bias.shape
+        with pytest.raises(InputError, match="the calibration was made for"):
+            source.check_size(shape)
+        source.close()
+    with pytest.raises(InputError, match="400 x 400 px, the calibration was made for 480 x 500"):
+        LiveSource(FolderFrames(tmp_path), calibration, model)
+
+
+class Full:
+    """A disk with room for some frames, then for half a frame more."""
+
+    def __init__(self, room: int, real):
+        self.room, self.real = room, real
+
+    def __call__(self, *arguments, **options):
+        if self.room == 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self.room -= 1
+        return self.real(*arguments, **options)
+
+
+@pytest.mark.parametrize("name", ["frames", "cubes.zarr"])
+def test_what_was_recorded_before_the_disk_was_full_stays_readable(
+    frames, calibration, tmp_path, monkeypatch, name
+):
+    recorder = Recorder(tmp_path / name)
+    model = load_model("ridge", calibration)
+    source = LiveSource(Stack(frames), calibration, model, recorder=recorder)
+    source.control("recording", True)
+    until(lambda: recorder.written >= 2)
+    if name == "frames":
+        import tifffile
+
+        monkeypatch.setattr(tifffile, "imwrite", Full(1, tifffile.imwrite))
+    else:
+        from zarr.storage import LocalStore
+
+        real = LocalStore.set
+
+        async def full(self, key, value, **options):
+            if "radiance/c" in key and full.room == 0:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            full.room -= "radiance/c" in key
+            return await real(self, key, value, **options)
+
+        full.room = 3
+        monkeypatch.setattr(LocalStore, "set", full)
+    said = until(lambda: source.now().status()["record_error"])
+    assert "No space left" in said
+    until(lambda: recorder.missed > 0)
+    written = recorder.written
+    monkeypatch.undo()
+    source.close()
+    assert written >= 2
+    if name == "frames":
+        assert len(list(read_raws(tmp_path / name))) == written
+    else:
+        with xr.open_zarr(tmp_path / name, consolidated=False) as back:
+            assert back.sizes["time"] == written
+            assert np.isfinite(back.radiance.values).all()
 
 
 @pytest.mark.parametrize("name", ["frames", "cubes.zarr"])
@@ -149,8 +280,8 @@ def test_recording(frames, calibration, tmp_path, name):
 
 
 def test_the_twin_moves_and_obeys(camera, scene, calibration):
-    twin = MovingTwin(camera, scene, poses=3, rate=50)
-    until(lambda: len(twin._rates) == 3)
+    twin = MovingTwin(camera, scene, rate=50)
+    until(lambda: twin.poses == 8)
     seen = []
 
     def both_ways() -> bool:
@@ -173,7 +304,7 @@ def test_a_folder_is_played_again_and_again(frames, tmp_path):
     assert isinstance(source, FolderFrames)
     for number in (0, 1, 2, 0, 1):
         np.testing.assert_array_equal(source.read().frame, frames[number].frame)
-    assert source.exposure is None
+    assert source.exposures is None
     with pytest.raises(InputError, match="taken with"):
         source.exposure = 3.0
     for wrong in ("webcam", str(tmp_path / "none")):
@@ -226,13 +357,13 @@ def test_the_last_of_many_wishes_is_answered(live):
 @pytest.mark.skipif(find() is None, reason=MISSING)
 def test_the_page_shows_the_twin_alive(camera, scene, calibration, tmp_path):
     """Pictures and spectra change by themselves; freezing stops them, exposure reaches the twin."""
-    twin = MovingTwin(camera, scene, poses=3, rate=30)
+    twin = MovingTwin(camera, scene, rate=30)
     model = load_model("ridge", calibration)
     source = LiveSource(twin, calibration, model, recorder=Recorder(tmp_path / "frames"))
     with running(source) as address, Browser() as browser:
         page = browser.page()
         page.open(f"http://{address}/")
-        page.wait("performance.getEntriesByName('squilla first picture').length > 0", 30)
+        page.wait("performance.getEntriesByName('squilla first picture').length > 0", 120)
         page.click("#picture")
         value = "document.querySelector('#spectra td.number').innerText"
         first = page.wait(f"({value}).replace('…', '')")
@@ -245,10 +376,18 @@ def test_the_page_shows_the_twin_alive(camera, scene, calibration, tmp_path):
         page.wait("document.querySelector('#recorded').innerText.includes('recorded')")
         page.click("#freeze")
         page.wait("document.querySelector('#freeze').getAttribute('aria-pressed') == 'true'")
-        time.sleep(0.5)
+        reads(source, 2)
+        page.wait(f"document.querySelector('#live').dataset.frame == {source._frame.number}")
         still = page.js(value)
-        time.sleep(0.5)
+        reads(source, 10)
         assert page.js(value) == still
+        page.click("#step")
+        page.wait(f"{value} != '{still}'")
+        page.click("#automatic")
+        until(lambda: source._automatic)
+        page.js("(e => { e.value = 3; e.dispatchEvent(new Event('change')); })"
+                "(document.querySelector('#gain'))")  # fmt: skip
+        until(lambda: twin.gain == 3)
         assert "/s" in str(page.js("document.querySelector('#facts').innerText"))
         assert page.complaints() == []
     source.close()

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -146,7 +147,7 @@ def test_by_need_gives_the_same(cube, maps, tmp_path, suffix, monkeypatch):
     path = tmp_path / f"doll{suffix}"
     save(cube, path, extra=maps)
     for longest in (1024, 16):
-        monkeypatch.setattr("squilla.live.stored.LARGEST_SIDE", longest)
+        monkeypatch.setattr("squilla.live.answer.LARGEST_SIDE", longest)
         held, by_need = StoredCube.open(path), StoredCube.open(path, held=0)
         assert by_need.describe()["by_need"]
         assert not held.describe()["by_need"]
@@ -322,14 +323,29 @@ def test_messages_are_bounded(address):
     assert let_in(address, origin=f"http://{address}")
 
 
-def flood(page: Line, opcode: int, payload: bytes) -> int:
+def deaf(address: str) -> socket.socket:
+    """Return a WebSocket's line that nobody reads from."""
+    host, port = address.split(":")
+    line = socket.socket()
+    line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    line.connect((host, int(port)))
+    line.sendall(
+        f"GET /socket HTTP/1.1\r\nHost: {address}\r\nOrigin: http://{address}\r\n"
+        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
+    )
+    assert line.recv(12) == b"HTTP/1.1 101"
+    return line
+
+
+def flood(line: socket.socket, opcode: int, payload: bytes) -> int:
     """Send frames and read nothing until no more are taken; return the bytes that were."""
-    raw, sent = page.socket.socket, 0
-    raw.settimeout(0.5)
+    sent = 0
+    line.settimeout(2)
     data = Frame(Opcode(opcode), payload, fin=opcode != Opcode.CONT).serialize(mask=True) * 64
     try:
         while sent < 32e6:
-            raw.sendall(data)
+            line.sendall(data)
             sent += len(data)
     except OSError:  # full, or thrown out
         pass
@@ -339,21 +355,21 @@ def flood(page: Line, opcode: int, payload: bytes) -> int:
 @pytest.mark.parametrize("kind", ["questions", "pings", "pieces"])
 def test_one_who_floods_stops_nobody(address, cube, kind):
     """What it sends is not taken any more, or it is thrown out; the others are served."""
-    deaf, other = Line(address, room=4096), Line(address)
     ask = {"id": 1, "ask": "spectra", "regions": [[0, 0, 30, 40]] * 32}
     opcode, payload = {
         "questions": (Opcode.TEXT, json.dumps(ask).encode()),
         "pings": (Opcode.PING, b"x" * 125),
         "pieces": (Opcode.CONT, b""),
     }[kind]
-    if kind == "pieces":
-        deaf.socket.socket.sendall(Frame(Opcode.TEXT, b"{", fin=False).serialize(mask=True))
-    assert flood(deaf, opcode, payload) < 32e6
-    header, band = other.ask(ask="picture", kind="band", band=9)
-    np.testing.assert_array_equal(band[0], cube.values[..., 9])
-    assert header["id"] == 7
-    deaf.socket.socket.close()
-    other.socket.close()
+    with deaf(address) as line:
+        other = Line(address)
+        if kind == "pieces":
+            line.sendall(Frame(Opcode.TEXT, b"{", fin=False).serialize(mask=True))
+        assert flood(line, opcode, payload) < 32e6
+        header, band = other.ask(ask="picture", kind="band", band=9)
+        np.testing.assert_array_equal(band[0], cube.values[..., 9])
+        assert header["id"] == 7
+        other.socket.close()
 
 
 def test_pages_are_counted(address):

@@ -3,11 +3,22 @@
 import multiprocessing
 
 import numpy as np
+import pytest
 
 from conftest import small_design
 from squilla.camera.twin import Camera
+from squilla.errors import InputError
+from squilla.live import aravis
 from squilla.live.twin_camera import TwinCamera
 from squilla.live.twin_frames import TwinFrames
+
+
+try:
+    aravis.load()
+    missing = ""
+except InputError as error:
+    missing = str(error)
+installed = pytest.mark.skipif(bool(missing), reason=missing)
 
 
 def megapixel_frames() -> TwinFrames:

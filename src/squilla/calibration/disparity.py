@@ -8,6 +8,7 @@ pictures, of which each unit sees its own mixture (the pictures and mixtures are
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -290,6 +291,7 @@ def _relief(values, common, share, spread, free, slopes, baseline, shape) -> np.
     return np.stack([sums[0], sums[1] + 1e-6]).reshape(2, _PARTS, _PARTS)
 
 
+@lru_cache(maxsize=16)  # asked again for every frame
 def _grid(field: tuple[int, int], step: int) -> tuple:
     """Return the shape, monomials, first pixel and scale of every `step`-th point of a field.
 

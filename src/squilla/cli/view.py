@@ -2,6 +2,7 @@
 
 import math
 import webbrowser
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -85,7 +86,13 @@ def show(
 
 def live(
     calibration: Annotated[Path, typer.Option(help="Of the camera, .nc.")],
-    source: Annotated[str, typer.Option(help="twin, or a folder of raw frames.")] = "twin",
+    source: Annotated[
+        str,
+        typer.Option(
+            help="twin; genicam:ID as `squilla cameras` tells it, genicam for the first found; "
+            "or a folder of raw frames."
+        ),
+    ] = "twin",
     model: Annotated[str, typer.Option(help="A name of `squilla models`, or a file.")] = "ridge",
     camera: Annotated[
         str, typer.Option(help="The twin's design: built-in, or a TOML file.")
@@ -93,6 +100,12 @@ def live(
     scene: Annotated[str, typer.Option(help="What the twin sees: a scene or a file.")] = "chart",
     distance: Annotated[
         float | None, typer.Option(help="Of the scene, mm; default: found from each frame.")
+    ] = None,
+    exposure: Annotated[
+        float | None, typer.Option(help="ms; default: as the camera has it. The page can set it.")
+    ] = None,
+    gain: Annotated[
+        float | None, typer.Option(help="In the camera's unit; use the calibration's.")
     ] = None,
     record: Annotated[
         Path | None,
@@ -108,8 +121,10 @@ def live(
 
     Shows the newest frame, aligned and reconstructed.
 
-    Example: squilla live --source twin --calibration camera.nc --model ridge
+    Example: squilla live --source genicam --calibration camera.nc
     """
+    import torch
+
     from squilla.calibration.store import load_calibration
     from squilla.cli.checks import check_distance
     from squilla.live.pipeline import LiveSource
@@ -118,14 +133,18 @@ def live(
     from squilla.reconstruction.reconstructor import load_model
 
     check_distance(distance)
+    # A frame is measured while another is reconstructed; threads that wait for cores waste them.
+    torch.set_num_threads(max(1, torch.get_num_threads() // 2))
     learnt = load_calibration(calibration)
     reconstructor = load_model(model, learnt)
     recorder = None if record is None else Recorder(record)
-    frames = open_source(source, camera, scene)
-    shown = LiveSource(
-        frames, learnt, reconstructor, title=source, recorder=recorder, distance=distance
-    )
-    try:
-        show([shown], host=host, port=port, browser=browser, references=[])
-    finally:
-        shown.close()
+    with closing(open_source(source, camera, scene)) as frames:
+        if exposure is not None:
+            frames.exposure = exposure
+        if gain is not None:
+            frames.gain = gain
+        shown = LiveSource(
+            frames, learnt, reconstructor, title=source, recorder=recorder, distance=distance
+        )
+        with closing(shown):
+            show([shown], host=host, port=port, browser=browser, references=[])

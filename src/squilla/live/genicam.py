@@ -108,7 +108,7 @@ class LiveCamera:
         report: Callable[[str], None] | None,
     ):
         self._connect, self._patience = connect, patience
-        self._report = report or (lambda sentence: None)
+        self.report = report or (lambda sentence: None)
         self._lock = threading.RLock()
         self._statistics, self._last = Statistics(), None
         self._streaming = self._gone = self._closed = False
@@ -182,6 +182,16 @@ class LiveCamera:
     def exposure(self, exposure: float) -> None:
         self._within("exposure", exposure, self._connection.exposures, " ms")
         self._set("exposure", float(exposure))
+
+    @property
+    def exposures(self) -> tuple[float, float] | None:
+        """Least and largest exposure, ms; None at a camera without."""
+        return self._connection.exposures
+
+    @property
+    def gains(self) -> tuple[float, float] | None:
+        """Least and largest gain; None at a camera without."""
+        return self._connection.gains
 
     @property
     def gain(self) -> float | None:
@@ -459,7 +469,7 @@ class LiveCamera:
                 raise loss
             since = self._lost_since = self._lost_since or time.monotonic()
             self._streaming, self._gone = False, True
-            self._report(f"{loss} Looking for it for {self._patience:g} s.")
+            self.report(f"{loss} Looking for it for {self._patience:g} s.")
             self._connection.close()
         why: InputError = loss
         while (waited := time.monotonic() - since) < self._patience and not self._closed:
@@ -479,7 +489,7 @@ class LiveCamera:
                     connection.close()
                     continue
                 self._statistics.reconnected += 1
-            self._report(f"The camera {self.info} is back after {waited:.1f} s.")
+            self.report(f"The camera {self.info} is back after {waited:.1f} s.")
             return
         self._lost_since = None  # whoever asks again lets it be looked for again
         raise CameraLost(

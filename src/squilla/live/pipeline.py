@@ -3,6 +3,7 @@
 import threading
 import time
 import traceback
+import warnings
 from collections import deque
 from typing import Any
 
@@ -12,58 +13,29 @@ from squilla.calibration.alignment import Measurement, measure
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.files.raw import Raw
-from squilla.live.protocol import Picture, Spectra
+from squilla.live.answer import spectral_colours
+from squilla.live.exposure import better_exposure
+from squilla.live.frame import LiveFrame
 from squilla.live.record import Recorder
-from squilla.live.source import FrameSource
-from squilla.live.stored import StoredCube, spectral_colours
+from squilla.live.source import FrameSource, say
 from squilla.reconstruction.reconstructor import Reconstructor
 
 _ATTENTION = 2.0
 """Seconds after the last look at it for which a live view goes on measuring."""
 
+_REPEAT = 10.0
+"""Seconds for which the terminal is not told how a trouble changes."""
 
-class LiveFrame:
-    """One frame: its measurement, and its cube once somebody wants to see it."""
-
-    def __init__(
-        self, number: int, measurement: Measurement, model: Reconstructor, told: dict[str, Any]
-    ):
-        self.number = number
-        self._measurement, self._model, self._told = measurement, model, told
-        self._cube: StoredCube | None = None
-        self._lock = threading.Lock()
-
-    def cube(self) -> StoredCube:
-        """Return the reconstruction; worked out once."""
-        with self._lock:
-            if self._cube is None:
-                start = time.perf_counter()
-                cube = self._model.reconstruct(self._measurement)
-                valid = cube.isel(wavelength=0, drop=True).copy(
-                    data=self._measurement.valid.all(-1).numpy()
-                )
-                self._cube = StoredCube(cube, {"valid": valid}, title="live")
-                self._told["stages"]["reconstruct"] = 1000 * (time.perf_counter() - start)
-            return self._cube
-
-    def picture(self, ask: Picture) -> tuple[np.ndarray, dict[str, Any]]:
-        """Answer as a stored cube does."""
-        return self.cube().picture(ask)
-
-    def spectra(self, ask: Spectra) -> tuple[np.ndarray, dict[str, Any]]:
-        """Answer as a stored cube does."""
-        return self.cube().spectra(ask)
-
-    def status(self) -> dict[str, Any]:
-        """Return exposure, saturation, alignment, the times of the stages."""
-        return self._told
+_PATIENCE = 60.0
+"""Seconds for which a page waits for the first frame: on a new machine code is compiled before."""
 
 
 class LiveSource:
     """A camera as a source of the page: always the newest frame, measured in a thread of its own.
 
     Nothing queues: a frame that nobody had time for is replaced by the next. While nobody looks
-    and nothing is recorded, frames are only taken off the camera.
+    and nothing is recorded, frames are only taken off the camera. The places of the sub-images in
+    one frame are where the search begins in the next.
 
     Parameters
     ----------
@@ -89,16 +61,20 @@ class LiveSource:
     ):
         if calibration.lattice is None or calibration.pixels is None:
             raise InputError("A live view needs a calibration made by `squilla calibrate`.")
-        self._source, self._calibration, self._model = source, calibration, model
+        source.check_size(calibration.pixels.bias.shape)
+        source.report = self._heard
+        self._source, self._calibration, self._pixels = source, calibration, calibration.pixels
+        self._model, self._before = model, None
         self._title, self._recorder, self._distance = title, recorder, distance
         self._frame: LiveFrame | None = None
         self._trouble: str | None = None
+        self._said, self._automatic = 0.0, False
         self._frozen, self._step = False, threading.Event()
         self._looked = time.monotonic()
         self._times: deque[float] = deque(maxlen=20)
         self._number = 0
         self._ended = threading.Event()
-        self._first = threading.Event()
+        self._first = threading.Event()  # a frame, or why there is none
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -119,7 +95,8 @@ class LiveSource:
             "unit": "",
             "by_need": False,
             "live": True,
-            "adjustable": self._source.exposure is not None,
+            "exposures": self._source.exposures,
+            "gains": self._source.gains,
             "records": self._recorder is not None,
             "facts": {"model": self._model.name},
             "layers": [
@@ -135,7 +112,7 @@ class LiveSource:
         self._looked = time.monotonic()
         frame = self._frame
         if frame is None:
-            self._first.wait(5.0)
+            self._first.wait(_PATIENCE)
             frame = self._frame
         if frame is None:
             raise InputError(self._trouble or "The camera has not sent a frame yet.")
@@ -143,10 +120,15 @@ class LiveSource:
 
     def control(self, name: str, value: float | bool | None) -> dict[str, Any]:
         """Follow a wish of the page and return how things stand then."""
-        if name == "exposure":
+        if name in ("exposure", "gain"):
             if value is None or isinstance(value, bool):
-                raise InputError("The exposure must be a number of ms.")
-            self._source.exposure = float(value)
+                raise InputError(f"The {name} must be a number.")
+            self._automatic = self._automatic and name != "exposure"
+            setattr(self._source, name, float(value))
+        elif name == "automatic":
+            if self._source.exposures is None:
+                raise InputError("The exposure of this source cannot be set.")
+            self._automatic = bool(value)
         elif name == "frozen":
             self._frozen = bool(value)
         elif name == "step":
@@ -156,15 +138,15 @@ class LiveSource:
             if self._recorder is None:
                 raise InputError("Nothing is recorded: start with --record and a place to write.")
             self._recorder.start() if value else self._recorder.stop()
-        return {"exposure": self._source.exposure, "frozen": self._frozen} | self._recorded()
+        return self._switches()
 
     def close(self) -> None:
-        """End the thread, the recording and the camera."""
+        """End the camera, the thread and the recording."""
         self._ended.set()
-        self._thread.join(10)
+        self._source.close()  # whoever waits for a frame is told so
+        self._thread.join(30)
         if self._recorder is not None:
             self._recorder.stop()
-        self._source.close()
 
     # --- the thread -----------------------------------------------------------------------------
 
@@ -174,15 +156,28 @@ class LiveSource:
                 start = time.perf_counter()
                 raw = self._source.read(timeout=5.0)
                 taken = time.perf_counter() - start
+                if self._automatic:
+                    self._expose(raw)
                 if self._waits():
                     continue
                 self._publish(raw, taken)
                 self._trouble = None
             except InputError as error:  # a dark frame, a lost camera: told, not fatal
-                self._tell(str(error))
+                if not self._ended.is_set():
+                    self._tell(str(error))
+                    self._ended.wait(0.05)
             except Exception as error:  # a fault of ours: the view goes on and says so
                 traceback.print_exc()
                 self._tell(f"A frame could not be shown ({type(error).__name__}: {error}).")
+                self._ended.wait(0.05)
+
+    def _expose(self, raw: Raw) -> None:
+        """Set a better exposure, judged by a frame that was taken with the present one."""
+        limits = self._source.exposures
+        if limits is not None and raw.exposure == self._source.exposure:
+            better = better_exposure(raw, self._pixels, limits)
+            if better is not None:
+                self._source.exposure = better
 
     def _waits(self) -> bool:
         """Tell whether the frame just read is not to be shown."""
@@ -196,56 +191,84 @@ class LiveSource:
 
     def _publish(self, raw: Raw, taken: float) -> None:
         start = time.perf_counter()
-        measurement = measure(raw, self._calibration, distance=self._distance)
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always", UserWarning)
+            self._before = measurement = measure(
+                raw, self._calibration, distance=self._distance, start=self._last_placed()
+            )
         spent = time.perf_counter() - start
         self._times.append(time.monotonic())
+        provenance = measurement.provenance
         told = self._status(raw) | {
-            "snr": measurement.provenance["snr"],
-            "distance": measurement.provenance["distance"],
-            "alignment": measurement.provenance["alignment_score"],
+            "snr": provenance["snr"],
+            "distance": provenance["distance"],
+            "alignment": provenance["alignment_score"],
+            "notice": str(warned[0].message) if warned else None,
             "stages": {"frame": 1000 * taken, "measure": 1000 * spent},
         }
         self._number += 1
-        frame = LiveFrame(self._number, measurement, self._model, told)
+        frame = LiveFrame(self._number, measurement, self._model, told, self._frame)
         if self._recorder is not None and self._recorder.running:
             self._recorder.offer(raw, frame.cube)
         self._frame = frame
         self._first.set()
 
-    def _status(self, raw: Raw) -> dict[str, Any]:
-        pixels, counts = self._calibration.pixels, self._source.statistics
-        assert pixels is not None
-        times = self._times
-        rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else None
-        return {
-            "rate": rate,
-            "dropped": counts.skipped + counts.incomplete + counts.lost,
-            "exposure": raw.exposure,
-            "saturated": float(np.mean(raw.frame[::4, ::4] >= pixels.saturation)),
-            "frozen": self._frozen,
-            "error": None,
-        } | self._recorded()
+    def _last_placed(self) -> Measurement | None:
+        """Return the last measurement if its places came from the scene: the next begins there."""
+        before = self._before
+        placed = before is not None and before.provenance["alignment"] == "from the scene"
+        return before if placed else None
 
-    def _recorded(self) -> dict[str, Any]:
+    def _status(self, raw: Raw) -> dict[str, Any]:
+        counts, times = self._source.statistics, self._times
+        rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else None
+        few = raw.frame[::8, ::8]
+        return self._switches() | {
+            "rate": rate,
+            "dropped": counts.skipped + counts.lost,
+            "incomplete": counts.incomplete,
+            "exposure": raw.exposure,
+            "taken": raw.metadata.get("frame"),
+            "saturated": float(np.mean(few >= self._pixels.saturation)),
+            "error": None,
+        }
+
+    def _switches(self) -> dict[str, Any]:
+        """Return how what the page can set stands."""
+        told = {
+            "exposure": self._source.exposure,
+            "gain": self._source.gain,
+            "automatic": self._automatic,
+            "frozen": self._frozen,
+        }
         recorder = self._recorder
         if recorder is None:
-            return {"recording": False, "recorded": 0, "missed": 0, "record_error": None}
-        return {
+            return told | {"recording": False, "recorded": 0, "missed": 0, "record_error": None}
+        return told | {
             "recording": recorder.running,
             "recorded": recorder.written,
             "missed": recorder.missed,
             "record_error": recorder.error,
         }
 
+    def _heard(self, sentence: str) -> None:
+        """Hand on what happens to the camera."""
+        say(sentence)
+        self._show(sentence)
+
     def _tell(self, trouble: str) -> None:
-        """Show a trouble with the last good frame, once."""
+        """Tell why a frame is not shown; in the terminal not with each frame."""
+        now = time.monotonic()
+        if self._trouble is None or (trouble != self._trouble and now - self._said > _REPEAT):
+            self._said = now
+            say(trouble)
+        self._show(trouble)
+
+    def _show(self, trouble: str) -> None:
+        """Show a trouble on the page, with the last good frame."""
         last = self._frame
         if trouble != self._trouble and last is not None:
-            told = last.status() | {"error": trouble}
             self._number += 1
-            frame = LiveFrame(self._number, last._measurement, self._model, told)
-            frame._cube = last._cube
-            self._frame = frame
+            self._frame = last.again(self._number, last.status() | {"error": trouble})
         self._trouble = trouble
         self._first.set()
-        self._ended.wait(0.05)

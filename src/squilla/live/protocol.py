@@ -84,11 +84,11 @@ class Acknowledge(_Message):
 
 
 class Control(_Message):
-    """A wish to a live source: exposure (ms), frozen, step, recording."""
+    """A wish to a live source: exposure (ms), automatic exposure, gain, frozen, step, recording."""
 
     ask: Literal["control"]
     source: Annotated[int, Field(ge=0, lt=1000)] = 0
-    name: Literal["exposure", "frozen", "step", "recording"]
+    name: Literal["exposure", "automatic", "gain", "frozen", "step", "recording"]
     value: _Number | bool | None = None
 
 

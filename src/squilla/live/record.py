@@ -4,13 +4,15 @@ import queue
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from shutil import rmtree
 
 import numpy as np
+from xarray import DataArray
 
 from squilla.errors import InputError
 from squilla.files.cube import need_zarr, zarr_encoding
 from squilla.files.raw import Raw, write_raw
-from squilla.live.stored import StoredCube
+from squilla.live.source import say
 
 _WAITING = 2
 """Frames that may wait for the disk; with more a frame is missed, and counted."""
@@ -36,7 +38,7 @@ class Recorder:
         self.path, self.cubes = path, path.suffix == ".zarr"
         self.written = self.missed = 0
         self.error: str | None = None
-        self._waiting: queue.Queue[tuple[Raw, Callable[[], StoredCube]] | None] = queue.Queue(
+        self._waiting: queue.Queue[tuple[Raw, Callable[[], DataArray]] | None] = queue.Queue(
             _WAITING
         )
         self._thread: threading.Thread | None = None
@@ -70,7 +72,7 @@ class Recorder:
             self._waiting.put(None)
             thread.join()
 
-    def offer(self, raw: Raw, cube: Callable[[], StoredCube]) -> None:
+    def offer(self, raw: Raw, cube: Callable[[], DataArray]) -> None:
         """Hand over a frame; it is missed if the disk is behind."""
         try:
             self._waiting.put_nowait((raw, cube))
@@ -91,10 +93,27 @@ class Recorder:
                     write_raw(self.path / f"frame-{self._number:06d}.tiff", raw)
                 self.written += 1
             except (InputError, OSError) as error:  # a full disk: told on the page
-                self.error = str(error)
+                self.error = f"Recording has stopped: {error}"
+                say(self.error)
+                self._mend()
 
-    def _append(self, stored: StoredCube) -> None:
-        cube = stored.cube.astype(np.float32).rename("radiance").expand_dims("time")
+    def _mend(self) -> None:
+        """Take a cube back that is half written, so that those before it stay readable."""
+        if not self.cubes or not self.path.exists():
+            return
+        import zarr
+
+        try:
+            if self.written:
+                array = zarr.open_group(self.path, mode="r+")["radiance"]
+                array.resize((self.written, *array.shape[1:]))  # pyright: ignore
+            else:
+                rmtree(self.path)
+        except (OSError, KeyError, ValueError) as error:
+            say(f"The last cube in {self.path} may be half written ({error}).")
+
+    def _append(self, cube: DataArray) -> None:
+        cube = cube.astype(np.float32).rename("radiance").expand_dims("time")
         cube.attrs = {}
         dataset = cube.to_dataset()
         if self.path.exists():

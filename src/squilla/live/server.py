@@ -10,6 +10,7 @@ import asyncio
 import json
 import secrets
 import socket
+import time
 from collections.abc import Callable, Sequence
 from hashlib import sha256
 from importlib.resources import files as package_files
@@ -261,13 +262,27 @@ class Client:
         except InputError as error:
             await self._send({"id": watch.id, "error": str(error)})
             return
+        times: dict[str, float] = {}  # ms, of the frame before
         while True:
             self._frame, seen = view.number, view.number
             self._shown.clear()
+            start, sent = time.perf_counter(), 0.0
             for ask in watch.wanted:
-                await self._send_packed(await self._work(_asked, view, ask, {"frame": seen}))
-            await self._send({"frame": seen, "status": view.status(), "last": True})
+                answer = await self._work(_asked, view, ask, {"frame": seen})
+                before = time.perf_counter()
+                await self._send_packed(answer)
+                sent += time.perf_counter() - before
+            status = view.status()
+            status = status | {"stages": status["stages"] | times}
+            await self._send({"frame": seen, "status": status, "last": True})
+            answered = time.perf_counter()
             await self._shown.wait()
+            shown = time.perf_counter() - answered
+            times = {
+                "answer": 1000 * (answered - start - sent),
+                "send": 1000 * sent,
+                "page": 1000 * shown,
+            }
             while (view := source.now()).number <= seen:
                 await asyncio.sleep(_POLL)
 

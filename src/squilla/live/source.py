@@ -1,19 +1,28 @@
-"""Where live frames come from: the twin before a moving scene, a folder played again."""
+"""Where live frames come from: a camera, the twin before a moving scene, a folder played again."""
 
+import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 from xarray import DataArray
 
-from squilla.camera.scenes import load_scene
 from squilla.camera.twin import Camera
 from squilla.errors import InputError
 from squilla.files.raw import Raw, read_raws
+from squilla.live.twin_frames import TwinFrames, views
+
+Limits = tuple[float, float] | None
+"""Least and largest value that can be set; None where nothing can."""
+
+EXPOSURES = (0.001, 1e5)
+"""Exposures of the twin, ms."""
+
+GAINS = (0.0, 24.0)
+"""Gains of the twin, dB."""
 
 
 @dataclass
@@ -27,19 +36,44 @@ class Counts:
 
 
 class FrameSource(Protocol):
-    """A camera, or what plays one."""
+    """A camera, or what plays one. `read` and the settings may be called from different threads."""
+
+    report: Callable[[str], None]
+    """Is told in a sentence what happens to the camera while `read` waits."""
 
     @property
     def exposure(self) -> float | None:
-        """Exposure, ms; None where it cannot be set."""
+        """Exposure, ms; None where it is unknown."""
         ...
 
     @exposure.setter
     def exposure(self, exposure: float) -> None: ...
 
     @property
+    def gain(self) -> float | None:
+        """Gain in the camera's own unit, mostly dB; None at a camera without."""
+        ...
+
+    @gain.setter
+    def gain(self, gain: float) -> None: ...
+
+    @property
+    def exposures(self) -> Limits:
+        """Exposures that can be set, ms."""
+        ...
+
+    @property
+    def gains(self) -> Limits:
+        """Gains that can be set."""
+        ...
+
+    @property
     def statistics(self) -> Any:
         """`Counts`, or what has the same fields."""
+        ...
+
+    def check_size(self, shape: tuple[int, int]) -> None:
+        """Raise InputError unless frames have this shape, (rows, columns)."""
         ...
 
     def read(self, *, timeout: float = 5.0) -> Raw:
@@ -47,6 +81,11 @@ class FrameSource(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+def say(sentence: str) -> None:
+    """Say something in the terminal."""
+    print(f"squilla: {sentence}", file=sys.stderr, flush=True)
 
 
 class FolderFrames:
@@ -59,20 +98,41 @@ class FolderFrames:
         Frames a second, at most.
     """
 
+    exposures = gains = None
+
     def __init__(self, path: Path, *, rate: float = 10.0):
         self._path, self._clock = path, _Clock(rate)
-        self.statistics = Counts()
+        self.statistics, self.report = Counts(), say
         self._frames = read_raws(path)
         self._next: Raw | None = next(self._frames)  # what cannot be read is said at once
+        self._exposure = self._next.exposure
 
     @property
     def exposure(self) -> float | None:
-        """None: what was taken was taken."""
-        return None
+        """Exposure of the last frame, ms."""
+        return self._exposure
 
     @exposure.setter
     def exposure(self, exposure: float) -> None:
         raise InputError("Recorded frames have the exposure that they were taken with.")
+
+    @property
+    def gain(self) -> float | None:
+        """None: what was taken was taken."""
+        return None
+
+    @gain.setter
+    def gain(self, gain: float) -> None:
+        raise InputError("Recorded frames have the gain that they were taken with.")
+
+    def check_size(self, shape: tuple[int, int]) -> None:
+        """Raise InputError unless the first frame has this shape."""
+        if self._next is not None and self._next.frame.shape != tuple(shape):
+            rows, columns = self._next.frame.shape
+            raise InputError(
+                f"The frames of {self._path} have {rows} x {columns} px, the calibration was made "
+                f"for {shape[0]} x {shape[1]}: they are of different cameras or regions."
+            )
 
     def read(self, *, timeout: float = 5.0) -> Raw:
         """Return the next frame in its time."""
@@ -83,6 +143,7 @@ class FolderFrames:
             raw = next(self._frames)
         self._next = next(self._frames, None)
         self.statistics.delivered += 1
+        self._exposure = raw.exposure
         return raw
 
     def close(self) -> None:
@@ -99,15 +160,16 @@ class MovingTwin:
     ----------
     camera : Camera
     scene : str or DataArray
-        What `load_scene` takes, or a scene.
+        As `twin_frames.views` takes it.
     distance : float
         Middle distance, mm.
-    poses : int
     rate : float
         Frames a second, at most.
     seed : int
         Of the noise.
     """
+
+    exposures, gains = EXPOSURES, GAINS
 
     def __init__(
         self,
@@ -115,23 +177,15 @@ class MovingTwin:
         scene: str | DataArray = "chart",
         *,
         distance: float = 300.0,
-        poses: int = 8,
         rate: float = 10.0,
         seed: int = 0,
     ):
-        import torch
-
-        self._camera, self._clock = camera, _Clock(rate)
-        self._generator = torch.Generator().manual_seed(seed)
-        self.statistics = Counts()
-        if not isinstance(scene, DataArray):
-            scene = load_scene(scene, camera.design.wavelength, camera.design.field.size)
-        self._poses = _movement(scene, camera, distance, poses)
-        self._rates = [next(self._poses)]
-        bright = float(np.percentile(self._rates[0][::8, ::8], 99.5))
-        self._exposure = float(
-            np.clip(0.7 * camera.design.sensor.full_well / max(bright, 1e-9), 0.01, 1e4)
-        )
+        self._clock = _Clock(rate)
+        self.statistics, self.report = Counts(), say
+        self._poses = views(camera, scene, distance, moving=True)
+        self._frames = TwinFrames(camera, [next(self._poses)], seed)
+        self._bits = camera.design.sensor.bits
+        self._exposure, self._gain = self._frames.bright_exposure, 0.0
         self._ended = threading.Event()
         self._maker = threading.Thread(target=self._make, daemon=True)
         self._maker.start()
@@ -140,7 +194,12 @@ class MovingTwin:
         for rate in self._poses:
             if self._ended.is_set():
                 return
-            self._rates.append(rate)
+            self._frames.add(rate)
+
+    @property
+    def poses(self) -> int:
+        """Poses that are ready."""
+        return len(self._frames.means)
 
     @property
     def exposure(self) -> float | None:
@@ -149,19 +208,41 @@ class MovingTwin:
 
     @exposure.setter
     def exposure(self, exposure: float) -> None:
-        if not 0.001 <= exposure <= 1e5:
-            raise InputError(f"The exposure must be 0.001 to 100 000 ms, not {exposure:g}.")
+        low, high = EXPOSURES
+        if not low <= exposure <= high:
+            raise InputError(f"The exposure must be {low:g} to {high:g} ms, not {exposure:g}.")
         self._exposure = float(exposure)
+
+    @property
+    def gain(self) -> float | None:
+        """Gain, dB above that at which the full well fills the scale."""
+        return self._gain
+
+    @gain.setter
+    def gain(self, gain: float) -> None:
+        low, high = GAINS
+        if not low <= gain <= high:
+            raise InputError(f"The gain must be {low:g} to {high:g} dB, not {gain:g}.")
+        self._gain = float(gain)
+
+    def check_size(self, shape: tuple[int, int]) -> None:
+        """Raise InputError unless the twin's sensor has this shape."""
+        rows, columns = self._frames.design.sensor_shape
+        if (rows, columns) != tuple(shape):
+            raise InputError(
+                f"The twin's sensor has {rows} x {columns} px, the calibration was made for "
+                f"{shape[0]} x {shape[1]}; name its design with --camera."
+            )
 
     def read(self, *, timeout: float = 5.0) -> Raw:
         """Return a frame of the pose that is due."""
         number, missed = self._clock.wait()
         self.statistics.skipped += missed
         self.statistics.delivered += 1
-        there = len(self._rates)
-        place = number % max(1, 2 * there - 2)  # there and back
-        rate = self._rates[min(place, 2 * there - 2 - place) if there > 1 else 0]
-        return self._camera.expose(rate, self._exposure, self._generator)
+        exposure, gain = self._exposure, self._gain
+        frame = self._frames.draw(number, exposure, gain)
+        facts = {"camera": self._frames.serial, "bits": self._bits, "gain": gain, "frame": number}
+        return Raw(frame, exposure, facts)
 
     def close(self) -> None:
         """Stop making poses."""
@@ -187,30 +268,26 @@ class _Clock:
         return tick, missed
 
 
-def _movement(
-    scene: DataArray, camera: Camera, distance: float, poses: int
-) -> Iterator[np.ndarray]:
-    """Go through what falls on the sensor in the poses of half a swing, e-/ms."""
-    import torch
-    from torch.nn.functional import affine_grid, grid_sample
-
-    picture = torch.from_numpy(np.ascontiguousarray(scene.values)).permute(2, 0, 1)[None]
-    for swing in np.sin(np.linspace(-np.pi / 2, np.pi / 2, poses)):
-        angle, shift = np.radians(5 * swing), 0.12 * swing
-        turn = [
-            [np.cos(angle), -np.sin(angle), shift],
-            [np.sin(angle), np.cos(angle), shift / 2],
-        ]
-        where = affine_grid(torch.tensor([turn]).float(), list(picture.shape), align_corners=False)
-        moved = grid_sample(picture.float(), where, padding_mode="reflection", align_corners=False)
-        values = moved[0].permute(1, 2, 0).clamp_min(0).numpy()
-        yield camera.rate(scene.copy(data=values), distance=distance * (1 - 0.15 * swing))
-
-
 def open_source(name: str, camera: str, scene: str) -> FrameSource:
-    """Open a source by its name: "twin", or a folder or file of raw frames."""
+    """Open a source by its name.
+
+    Parameters
+    ----------
+    name : str
+        "twin"; "genicam:ID" or "gentl:ID" as `open_camera` takes them; or a folder or file of raw
+        frames.
+    camera, scene : str
+        The twin's design, and what it sees.
+    """
     if name == "twin":
         return MovingTwin(Camera(camera), scene)
+    if name.partition(":")[0] in ("genicam", "gentl"):
+        from squilla.live.genicam import open_camera
+
+        return open_camera(name if ":" in name else f"{name}:", report=say)
     if Path(name).exists():
         return FolderFrames(Path(name))
-    raise InputError(f"There is no source {name!r}; give twin, or a folder of raw frames.")
+    raise InputError(
+        f"There is no source {name!r}; give twin, genicam:ID as `squilla cameras` tells it, or a "
+        "folder of raw frames."
+    )

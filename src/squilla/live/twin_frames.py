@@ -1,9 +1,10 @@
 """Frames of the twin at the pace of a camera: noise fast enough for twelve megapixels live."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 
 import numba
 import numpy as np
+from xarray import DataArray
 
 from squilla.camera.scenes import load_scene
 from squilla.camera.twin import Camera
@@ -12,6 +13,9 @@ from squilla.live.connection import Region
 
 _QUANTILES = 1 << 16
 
+POSES = 8
+"""Steps of half a swing of a moving scene."""
+
 
 class TwinFrames:
     """What the twin's sensor shows of a few unchanging views, frame after frame.
@@ -19,8 +23,9 @@ class TwinFrames:
     Parameters
     ----------
     camera : Camera
-    rates : sequence of array, (rows, columns)
-        Photoelectrons per ms, as `Camera.rate` returns them; frames go through them in turn.
+    rates : iterable of array, (rows, columns)
+        Photoelectrons per ms, as `Camera.rate` returns them; frames go through them there and back.
+        More may be added with `add`.
     seed : int
         Of the noise.
 
@@ -37,17 +42,22 @@ class TwinFrames:
     deviations and is the same each time the same frame is asked for.
     """
 
-    def __init__(self, camera: Camera, rates: Sequence[np.ndarray], seed: int = 0):
-        sensor = camera.sensor
+    def __init__(self, camera: Camera, rates: Iterable[np.ndarray], seed: int = 0):
         self.design, self.serial, self.seed = camera.design, camera.serial, seed
-        if not rates or any(rate.shape != self.design.sensor_shape for rate in rates):
+        self._sensor, self._normal = camera.sensor, _normal_quantiles()
+        self.means: list[np.ndarray] = []
+        for rate in rates:
+            self.add(rate)
+
+    def add(self, rate: np.ndarray) -> None:
+        """Add a view at the end of the movement."""
+        if rate.shape != self.design.sensor_shape:
             raise InputError(
-                f"Frames need one or more pictures of {self.design.sensor_shape} px of electrons "
-                "per ms."
+                f"Frames need pictures of {self.design.sensor_shape} px of electrons per ms, not "
+                f"of {rate.shape}."
             )
-        seen = {id(rate): rate * sensor.response + sensor.dark_rate for rate in rates}
-        self.means = [seen[id(rate)].astype(np.float32, copy=False) for rate in rates]
-        self._normal = _normal_quantiles()
+        mean = rate * self._sensor.response + self._sensor.dark_rate
+        self.means.append(mean.astype(np.float32, copy=False))
 
     @property
     def bright_exposure(self) -> float:
@@ -77,7 +87,9 @@ class TwinFrames:
         """
         effects, sensor = self.design.effects, self.design.sensor
         part = region or Region(*self.design.sensor_shape)
-        mean = self.means[number % len(self.means)]
+        last = len(self.means) - 1
+        step = number % max(2 * last, 1)
+        mean = self.means[min(step, 2 * last - step)]
         mean = mean[part.row : part.row + part.rows, part.column : part.column + part.columns]
         frame = np.empty(mean.shape, np.uint16)
         read_noise = sensor.read_noise if effects.read_noise else 0.0
@@ -97,34 +109,51 @@ class TwinFrames:
 
 
 def views(
-    camera: Camera, scene: str, distance: float = 300.0, *, moving: bool = False
-) -> list[np.ndarray]:
-    """Return what falls on the sensor, photoelectrons per ms, once or in the steps of a movement.
+    camera: Camera,
+    scene: str | DataArray,
+    distance: float = 300.0,
+    *,
+    moving: bool = False,
+) -> Iterator[np.ndarray]:
+    """Go through what falls on the sensor, photoelectrons per ms: one view, or half a swing.
 
     Parameters
     ----------
     camera : Camera
-    scene : str
-        "dark" for a covered lens, "white" for an even white that fills every view, or what
-        `load_scene` takes.
+    scene : str or DataArray
+        "dark" for a covered lens, "white" for an even white that fills every view, what
+        `load_scene` takes, or a scene.
     distance : float
-        mm.
+        mm; of the middle, where the scene moves.
     moving : bool
-        Let the scene swing from side to side in eight steps of a tenth of the field.
+        Let the scene drift, turn and come nearer, from one end of a swing to the other.
     """
-    if scene == "dark":
-        return [np.zeros(camera.design.sensor_shape, np.float32)]
-    if scene == "white":
-        return [camera.flat_rate(np.ones(len(camera.design.wavelength)))]
-    size = camera.design.field.size
-    picture = load_scene(scene, camera.design.wavelength, size)
-    step = max(1, size // 10) if moving else 0
-    places = (0, 1, 2, 1, 0, -1, -2, -1) if moving else (0,)
-    seen = {
-        place: camera.rate(picture.roll(x=place * step), distance=distance)
-        for place in sorted(set(places))
-    }
-    return [seen[place] for place in places]
+    if isinstance(scene, str):
+        if scene == "dark":
+            yield np.zeros(camera.design.sensor_shape, np.float32)
+            return
+        if scene == "white":
+            yield camera.flat_rate(np.ones(len(camera.design.wavelength)))
+            return
+        scene = load_scene(scene, camera.design.wavelength, camera.design.field.size)
+    if not moving:
+        yield camera.rate(scene, distance=distance)
+        return
+    for swing in np.sin(np.linspace(-np.pi / 2, np.pi / 2, POSES)):
+        yield camera.rate(_moved(scene, float(swing)), distance=distance * (1 - 0.15 * swing))
+
+
+def _moved(scene: DataArray, swing: float) -> DataArray:
+    """Return a scene turned and shifted by its place in the swing, -1..1; its edges reflect it."""
+    import torch
+    from torch.nn.functional import affine_grid, grid_sample
+
+    picture = torch.from_numpy(np.ascontiguousarray(scene.values)).permute(2, 0, 1)[None].float()
+    angle, shift = np.radians(5 * swing), 0.12 * swing
+    turn = [[np.cos(angle), -np.sin(angle), shift], [np.sin(angle), np.cos(angle), shift / 2]]
+    where = affine_grid(torch.tensor([turn]).float(), list(picture.shape), align_corners=False)
+    moved = grid_sample(picture, where, padding_mode="reflection", align_corners=False)
+    return scene.copy(data=moved[0].permute(1, 2, 0).clamp_min(0).numpy())
 
 
 def _normal_quantiles() -> np.ndarray:

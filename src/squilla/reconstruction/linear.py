@@ -1,5 +1,7 @@
 """The linear (Wiener) estimator, and the filling of invalid channels, which is the same algebra."""
 
+from collections.abc import Sequence
+from copy import copy
 from functools import lru_cache
 
 import numpy as np
@@ -53,18 +55,29 @@ class Ridge(Reconstructor):
         self.register_buffer("power", power.clamp_min(0).float(), persistent=False)
         self.register_buffer("gain", (basis.mT @ response @ moment).float(), persistent=False)
 
+    def only(self, bands: Sequence[int]) -> "Ridge":
+        some = copy(self)
+        some._buffers = self._buffers | {"gain": self.gain[..., list(bands)].contiguous()}
+        some.wavelength = np.asarray(self.wavelength)[list(bands)]
+        return some
+
     def estimate(self, y: Tensor, angle: Tensor | None = None, snr: Tensor | None = None) -> Tensor:
         noise = _noise_to_signal(snr, len(y), y.device)[:, None]
         if angle is None:
             power = self.power[-1]
             return (y @ self.basis[-1] / (power + noise * power.mean())) @ self.gain[-1]
         weights = self.calibration.angle_weights(angle)
-        # One product for all angles: the components, weighted by each angle, side by side.
-        parts = [
-            weight[:, None] * (y @ basis) / (power + noise * power.mean())
-            for weight, basis, power in zip(weights.T, self.basis, self.power, strict=False)
-        ]
-        return torch.cat(parts, -1) @ self.gain[:-1].flatten(0, 1)
+        lower = (weights > 0).to(torch.uint8).argmax(-1).clamp_max(weights.shape[-1] - 2)
+        x = y.new_empty(len(y), self.gain.shape[-1])
+        for low in range(weights.shape[-1] - 1):  # a pixel lies between two angles
+            some = (lower == low).nonzero()[:, 0]
+            pair = slice(low, low + 2)
+            # One product for both: the components, weighted by each angle, side by side.
+            seen = (y[some] @ self.basis[pair].mT.flatten(0, 1).mT).unflatten(-1, (2, -1))
+            level = noise[some, None] * self.power[pair].mean(-1, keepdim=True)
+            seen *= weights[some, pair, None] / (self.power[pair] + level)
+            x[some] = seen.flatten(1) @ self.gain[pair].flatten(0, 1)
+        return x
 
 
 def levelling(calibration: Calibration) -> Tensor:
@@ -167,9 +180,11 @@ def complete(
             f"The valid mask has the shape {tuple(valid.shape)}, the measurement "
             f"{tuple(y.shape)}; they must agree."
         )
-    valid = valid & y.isfinite()
-    enough = valid.sum(-1) >= (y.shape[-1] + 1) // 2
-    partial = enough & ~valid.all(-1)
+    if not y.sum().isfinite():
+        valid = valid & y.isfinite()
+    count = valid.sum(-1)
+    enough = count >= (y.shape[-1] + 1) // 2
+    partial = enough & (count < y.shape[-1])
     filled = torch.where(enough[..., None], y, torch.nan)
     if not partial.any():
         return filled

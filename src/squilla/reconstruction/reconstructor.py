@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from importlib import import_module
 from importlib.resources import files as package_files
@@ -134,7 +134,7 @@ class Reconstructor(nn.Module):
         return torch.cat(parts).reshape(*pixels, len(self.wavelength))
 
     def _piece(self, y: Tensor, angle: Tensor | None, snr: Tensor | None, scale: Scale) -> Tensor:
-        finite = y.isfinite().all(-1, keepdim=True)
+        finite = y.sum(-1, keepdim=True).isfinite()
         y = torch.where(finite, y, 0)
         peak = y.amax(-1, keepdim=True)
         lit = peak > 0
@@ -144,6 +144,13 @@ class Reconstructor(nn.Module):
         if self.trained and scale == "consistent":
             factor = factor * consistent_scale(y, x, self.calibration, angle)
         return x * factor
+
+    def only(self, bands: Sequence[int]) -> "Reconstructor | None":
+        """Return what estimates these bands alone, for less; None where all cost the same.
+
+        What it can, pixels can be reconstructed without their neighbours.
+        """
+        return None
 
     def levelled(self, y: Tensor, angle: Tensor | None) -> Tensor:
         """Return measurements as `estimate` wants them, (N, M).

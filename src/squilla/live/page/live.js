@@ -6,6 +6,17 @@ import { element } from "./spectra.js";
 
 const WATCH = 0; // no question has this number: an answer to it is a refusal to watch
 
+/** Where the time of a frame goes. */
+const STAGES = [
+  ["frame", "Read", "Until the camera had a frame"],
+  ["measure", "Measure", "Correct the frame, find the disparity, align the sub-images"],
+  ["decode", "Decode", "Reconstruct what is shown"],
+  ["send", "Send", "To this page"],
+  ["page", "Page", "Until this page had painted it"],
+];
+
+const ms = (value) => (value === undefined ? "–" : `${Math.round(value)} ms`);
+
 const $ = (id) => document.getElementById(id);
 
 export class Live {
@@ -16,10 +27,13 @@ export class Live {
     this.wanted = [];
     this.answers = new Map();
     this.times = [];
-    $("exposure").addEventListener("change", () => this.wish("exposure", Number($("exposure").value)));
-    $("freeze").onclick = () => this.wish("frozen", $("freeze").getAttribute("aria-pressed") !== "true");
+    for (const name of ["exposure", "gain"]) {
+      $(name).addEventListener("change", () => this.wish(name, Number($(name).value)));
+    }
+    for (const [id, name] of [["automatic", "automatic"], ["freeze", "frozen"], ["record", "recording"]]) {
+      $(id).onclick = () => this.wish(name, $(id).getAttribute("aria-pressed") !== "true");
+    }
     $("step").onclick = () => this.wish("step", true);
-    $("record").onclick = () => this.wish("recording", $("record").getAttribute("aria-pressed") !== "true");
   }
 
   open(about) {
@@ -27,7 +41,11 @@ export class Live {
     this.on = Boolean(about.live);
     $("live").hidden = !this.on;
     if (!this.on) return;
-    $("exposure").disabled = !about.adjustable;
+    $("exposure").disabled = $("automatic").disabled = !about.exposures;
+    $("gain").parentElement.hidden = !about.gains;
+    for (const [name, limits] of [["exposure", about.exposures], ["gain", about.gains]]) {
+      $(name).title = limits ? `${short(limits[0])} to ${short(limits[1])}` : "Taken with the frames";
+    }
     $("record").disabled = !about.records;
     $("record").title = about.records ? "Record frames" : "Start with --record and a place to write";
   }
@@ -56,9 +74,11 @@ export class Live {
     setTimeout(() => this.watch(), 1000);
   }
 
-  trouble(sentence) {
+  /** Say what is wrong, or with `mild` what one should know. */
+  trouble(sentence, mild = false) {
     $("trouble").hidden = !sentence;
-    $("trouble").textContent = sentence ?? "";
+    $("trouble").className = mild ? "hint" : "bad";
+    if ($("trouble").textContent !== (sentence ?? "")) $("trouble").textContent = sentence ?? "";
   }
 
   frame(header, values) {
@@ -78,6 +98,7 @@ export class Live {
     const spectra = this.answers.get(this.pictures.length);
     if (spectra) this.take(spectra);
     this.answers.clear();
+    $("live").dataset.frame = header.frame;
   }
 
   take({ header, values }) {
@@ -107,8 +128,11 @@ export class Live {
   }
 
   /** Show how the switches stand. */
-  stand({ exposure, frozen, recording, recorded, missed }) {
-    if (document.activeElement !== $("exposure")) $("exposure").value = exposure === null ? "" : short(exposure, 4);
+  stand({ exposure, gain, automatic, frozen, recording, recorded, missed }) {
+    for (const [name, value] of [["exposure", exposure], ["gain", gain]]) {
+      if (document.activeElement !== $(name)) $(name).value = value === null ? "" : short(value, 4);
+    }
+    $("automatic").setAttribute("aria-pressed", automatic);
     $("freeze").setAttribute("aria-pressed", frozen);
     $("record").setAttribute("aria-pressed", recording);
     $("recorded").textContent = recorded || missed ? `${recorded} recorded${missed ? `, ${missed} missed` : ""}` : "";
@@ -118,23 +142,19 @@ export class Live {
     this.stand(told);
     const [first, last] = [this.times[0], this.times.at(-1)];
     const shown = this.times.length > 1 ? (this.times.length - 1) / (last - first) * 1000 : null;
-    const { frame, measure, reconstruct } = told.stages ?? {};
-    const ms = (value) => (value === undefined ? "–" : `${Math.round(value)} ms`);
     const facts = [
       ["Shown", shown === null ? "–" : `${shown.toFixed(1)} /s`],
       ["Measured", told.rate === null ? "–" : `${told.rate.toFixed(1)} /s`],
       ["Dropped", String(told.dropped)],
+      ["Incomplete", String(told.incomplete)],
       ["Saturated", `${(100 * told.saturated).toFixed(told.saturated > 0.1 ? 0 : 2)} %`, told.saturated > 0.01],
       ["Alignment", told.alignment.toFixed(2), told.alignment < 0.1],
       ["Distance", `${Math.round(told.distance)} mm`],
       ["SNR", `${told.snr.toFixed(1)} dB`],
-      ["Exposure", told.exposure === null ? "–" : `${short(told.exposure, 3)} ms`],
-      ["Frame", ms(frame)],
-      ["Measure", ms(measure)],
-      ["Cube", ms(reconstruct)],
+      ...STAGES.map(([name, label, title]) => [label, ms(told.stages[name]), false, title]),
     ];
-    $("facts").replaceChildren(...facts.map(([name, value, bad]) => element("div", {},
+    $("facts").replaceChildren(...facts.map(([name, value, bad, title = ""]) => element("div", { title },
       element("dt", {}, name), element("dd", { className: bad ? "bad" : "" }, value))));
-    this.trouble(told.error ?? told.record_error);
+    this.trouble(told.error ?? told.record_error ?? told.notice, !(told.error ?? told.record_error));
   }
 }

@@ -1,0 +1,225 @@
+"""Time the live view from a 12-megapixel raw frame to what a page has shown.
+
+    python benchmarks/live.py [--calibration camera.nc] [-o experiments/results/live.json]
+
+A client in a process of its own talks to the real server over a real WebSocket, watches colour,
+three bands and the spectra of two points and a region, and acknowledges as the page does. Frames
+come ready from memory, from the twin that draws new noise for each, and from the twin as a GenICam
+camera within the process (Mono12p, packed and unpacked). Without --calibration the thesis' camera
+is calibrated first, which takes some minutes.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import platform
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from statistics import median
+
+import numba
+import numpy as np
+import torch
+
+import squilla
+from squilla.calibration.alignment import align, measure
+from squilla.calibration.disparity import find_plane, plane_map
+from squilla.calibration.edges import find_edges
+from squilla.calibration.rehearsal import Rehearsal
+from squilla.calibration.views import evened, sub_images
+from squilla.camera.twin import Camera
+from squilla.files.raw import Raw
+from squilla.live.frame import Look
+from squilla.live.pipeline import LiveSource
+from squilla.live.source import Counts, MovingTwin
+from squilla.live.twin_camera import camera_within
+from squilla.live.twin_frames import TwinFrames, views
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+from browser import Browser, find
+from serving import Line, running
+
+SHOWN = (160, 80, 0)  # 660, 580, 500 nm of 251 bands
+PLACES = [[100, 100, 101, 101], [20, 200, 21, 201], [120, 60, 130, 70]]
+
+
+class Ready:
+    """A camera whose frames lie in memory and cost nothing."""
+
+    exposures = gains = gain = None
+
+    def __init__(self, raws: list[Raw]):
+        self.raws, self.statistics, self.report = raws, Counts(), print
+        self.exposure = raws[0].exposure
+
+    def check_size(self, shape) -> None: ...
+    def close(self) -> None: ...
+
+    def read(self, *, timeout: float = 5.0) -> Raw:
+        self.statistics.delivered += 1
+        return self.raws[self.statistics.delivered % len(self.raws)]
+
+
+def look(address: str, seconds: float, pipe) -> None:
+    """Be a page: watch, acknowledge, note when frames were complete."""
+    line = Line(address)
+    pictures = [{"kind": "colour"}, *({"kind": "band", "band": band} for band in SHOWN)]
+    wanted = [*pictures, {"ask": "spectra", "regions": PLACES}]
+    line.socket.send(json.dumps({"ask": "watch", "wanted": wanted}))
+    times, stages, end = [], [], None
+    while end is None or time.perf_counter() < end:
+        header, _ = line.receive()
+        if not header.get("last"):
+            assert "error" not in header, header
+            continue
+        line.socket.send(json.dumps({"ask": "acknowledge", "frame": header["frame"]}))
+        times.append(time.perf_counter())
+        stages.append(header["status"]["stages"])
+        if len(times) == 8:  # warm
+            end, times, stages = time.perf_counter() + seconds, times[-1:], []
+    line.socket.close()
+    pipe.send((times, stages))
+
+
+def watched(source, calibration, model, seconds: float) -> dict[str, float]:
+    """Return frames a second and the median time of each stage, as a client over the wire sees."""
+    with closing(LiveSource(source, calibration, model)) as live, running(live) as address:
+        live.now()
+        ours, theirs = multiprocessing.Pipe()
+        client = multiprocessing.get_context("spawn").Process(
+            target=look, args=(address, seconds, theirs)
+        )
+        client.start()
+        times, stages = ours.recv()
+        client.join()
+    result = {"frames_per_s": (len(times) - 1) / (times[-1] - times[0])}
+    for name in ("frame", "measure", "decode", "answer", "send", "page"):
+        result[name] = median(each.get(name, 0.0) for each in stages)
+    return result
+
+
+def painted(source, calibration, model, seconds: float) -> float:
+    """Return pictures a second that headless Chromium has painted of three bands."""
+    with closing(LiveSource(source, calibration, model)) as live, running(live) as address:
+        live.now()
+        with Browser() as browser:
+            page = browser.page()
+            page.open(f"http://{address}/")
+            page.wait("performance.getEntriesByName('squilla first picture').length > 0", 60)
+            page.click("#picture")
+            time.sleep(seconds)
+            return float(str(page.js("document.querySelector('#facts dd').innerText")).split()[0])
+
+
+@contextmanager
+def sources(camera: Camera, raws: list[Raw], rates) -> Iterator[dict[str, Callable]]:
+    frames = TwinFrames(camera, rates)
+    with camera_within(frames, rate=100.0) as aravis:
+        aravis.exposure = frames.bright_exposure / 20
+        moving = MovingTwin(camera, "chart", rate=100.0)
+        moving.exposure = moving.exposure / 20  # no longer than a frame
+        yield {"ready in memory": Ready(raws), "twin": moving, "twin over GenICam": aravis}
+
+
+def stages(calibration, raws: list[Raw], models: dict) -> dict[str, float]:
+    """Return the time of each step of measuring and decoding by itself, ms."""
+    lattice, pixels = calibration.lattice, calibration.pixels
+    first = measure(raws[0], calibration)
+    start = np.array([first.provenance["disparity"], 0, 0])
+    margin = int(np.ceil((start[0] + 0.5) * np.abs(lattice.baseline).max())) + 8
+    cut = sub_images(raws[1], lattice, pixels, margin)
+    even = evened(cut, lattice, calibration)
+    noise = even.image.mean((1, 2)).numpy() / pixels.gain + 1
+    edges = find_edges(even.image.numpy(), even.bad.numpy(), noise, step=4)
+    flat = plane_map(start, lattice)
+    steps: dict[str, Callable] = {
+        "cut out and correct": lambda: sub_images(raws[1], lattice, pixels, margin),
+        "take the shading out": lambda: evened(cut, lattice, calibration),
+        "edges": lambda: find_edges(even.image.numpy(), even.bad.numpy(), noise, step=4),
+        "plane, from the frame before": lambda: find_plane(
+            edges, lattice, even.margin + even.offset, (0, 3.0), start=start
+        ),
+        "resample": lambda: align(cut, lattice, flat),
+        "measure, from the frame before": lambda: measure(raws[1], calibration, start=first),
+        "measure, from nothing": lambda: measure(raws[1], calibration),
+    }
+    wanted = [*range(0, 251, 7), *SHOWN]
+    point = slice(100, 101), slice(100, 101)
+    for name, model in models.items():
+        if model.only([0]) is not None:
+            steps[f"{name}: colour and three bands"] = lambda m=model: Look(m, first).bands(wanted)
+            steps[f"{name}: spectrum of a point"] = lambda m=model: Look(m, first).spectra(*point)
+        steps[f"{name}: whole cube"] = lambda m=model: Look(m, first).cube()
+    found = {}
+    for name, call in steps.items():
+        call()
+        wall, work = [], []
+        for _ in range(9 if "cube" not in name or "ridge" in name else 1):
+            begin, busy = time.perf_counter(), time.process_time()
+            call()
+            wall.append(1000 * (time.perf_counter() - begin))
+            work.append(1000 * (time.process_time() - busy))
+        found[name] = {"ms": median(wall), "cpu_ms": min(work)}
+        print(f"| {name} | {median(wall):.1f} | {min(work):.1f} |", flush=True)
+    return found
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--calibration", type=Path)
+    options.add_argument("-o", "--output", type=Path)
+    options.add_argument("--models", nargs="+", default=["ridge"])
+    options.add_argument("--seconds", type=float, default=6.0)
+    options.add_argument("--browser", action="store_true", help="Chromium's pictures too.")
+    given = options.parse_args()
+    warnings.simplefilter("ignore", UserWarning)
+    camera = Camera("thesis")
+    if given.calibration:
+        calibration = squilla.load_calibration(given.calibration)
+    else:
+        rehearsal = Rehearsal(camera, step=5.0, bandwidth=5.0)
+        calibration = squilla.calibrate(
+            camera.design, dark=rehearsal.dark(), flat=rehearsal.flat(), sweep=rehearsal.sweep(),
+            target=rehearsal.target(), target_distance=rehearsal.distance,
+        )  # fmt: skip
+    rates = list(views(camera, "chart"))
+    frames = TwinFrames(camera, rates)
+    exposure = frames.bright_exposure
+    raws = [Raw(frames.draw(n, exposure), exposure, {"camera": camera.serial}) for n in range(4)]
+    models = {name: squilla.load_model(name, calibration) for name in given.models}
+    machine = (
+        f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch and "
+        f"{numba.get_num_threads()} numba threads"
+    )
+    results = {"machine": machine, "load_before": os.getloadavg()[0]}
+    print(f"{machine}, load {os.getloadavg()[0]:.1f}\n\n| step | ms | CPU ms |\n|---|---|---|")
+    results["steps"] = stages(calibration, raws, models)
+    torch.set_num_threads(max(1, torch.get_num_threads() // 2))  # as `squilla live` does
+    print("\n| source, model | frames/s | read | measure | decode | answer | send | page |")
+    print("|" + "---|" * 8)
+    results["live"] = {}
+    with sources(camera, raws, rates) as there:
+        for kind, source in there.items():
+            for name, model in models.items():
+                seen = watched(source, calibration, model, given.seconds)
+                results["live"][f"{kind}, {name}"] = seen
+                row = " | ".join(f"{value:.1f}" for value in seen.values())
+                print(f"| {kind}, {name} | {row} |", flush=True)
+    if given.browser and find():
+        model = models[given.models[0]]
+        rate = painted(Ready(raws), calibration, model, given.seconds)
+        results["chromium_pictures_per_s"] = rate
+        print(f"\nHeadless Chromium painted {rate:.1f} pictures/s.")
+    results["load_after"] = os.getloadavg()[0]
+    if given.output:
+        given.output.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""One live frame: measured, and of its cube only what somebody looks at."""
+
+import time
+from collections.abc import Callable, Iterator
+from copy import copy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from xarray import DataArray
+
+from squilla.calibration.alignment import Measurement
+from squilla.live.answer import Answers
+from squilla.reconstruction.reconstructor import Reconstructor
+
+class Look:
+    """Works out of a measurement what is asked for: some bands, some spectra, or the whole cube.
+
+    Parameters
+    ----------
+    model : Reconstructor
+        One that cannot do with less makes the cube, once.
+    measurement : Measurement
+    """
+
+    def __init__(self, model: Reconstructor, measurement: Measurement):
+        self._model, self._measurement = model, measurement
+        self._cube: DataArray | None = None
+
+    def cube(self) -> DataArray:
+        """Return all spectra of all pixels."""
+        if self._cube is None:
+            self._cube = self._model.reconstruct(self._measurement)
+        return self._cube
+
+    def bands(self, numbers: list[int]) -> np.ndarray:
+        """Return some bands of all pixels, (H, W, bands)."""
+        some = None if self._cube is not None else self._model.only(numbers)
+        if some is None:
+            return self.cube().values[..., numbers]
+        return some.reconstruct(self._measurement).values
+
+    def spectra(self, rows: slice, columns: slice) -> np.ndarray:
+        """Return all bands of some pixels, (h, w, K)."""
+        if self._cube is not None or self._model.only([0]) is None:
+            return self.cube().values[rows, columns]
+        part = {
+            name: None if (whole := getattr(self._measurement, name)) is None else whole[place]
+            for name in ("y", "valid", "angle", "disparity", "snr")
+            for place in [(rows, columns)]
+        }
+        return self._model.reconstruct(replace(self._measurement, **part)).values
+
+
+class LiveFrame(Answers):
+    """Answers what a page asks of one frame.
+
+    Parameters
+    ----------
+    number : int
+        Of the frame, increasing.
+    measurement : Measurement
+    model : Reconstructor
+    told : dict
+        What the page shows of the frame; the time of reconstruction is added.
+    before : LiveFrame, optional
+        What was asked of the frame before is expected to be asked of this one too.
+    """
+
+    few_bands = True
+
+    def __init__(
+        self,
+        number: int,
+        measurement: Measurement,
+        model: Reconstructor,
+        told: dict[str, Any],
+        before: "LiveFrame | None" = None,
+    ):
+        valid = DataArray(measurement.valid.all(-1).numpy(), dims=("y", "x"))
+        rows, columns, _ = measurement.y.shape
+        super().__init__("live", (rows, columns), np.asarray(model.wavelength), {"valid": valid})
+        self.number, self._told = number, told
+        self._look = Look(model, measurement)
+        self._expected = [] if before is None else before._asked or before._expected
+        self._asked: list[int] = []
+        self._places: dict[int, tuple[int, int]] = {}  # of each decoded band
+        self._planes: list[np.ndarray] = []
+
+    def status(self) -> dict[str, Any]:
+        """Return exposure, saturation, alignment, the times of the stages."""
+        return self._told
+
+    def again(self, number: int, told: dict[str, Any]) -> "LiveFrame":
+        """Return the same picture as another frame, of which other things are told."""
+        other = copy(self)
+        other.number, other._told = number, told
+        return other
+
+    def cube(self) -> DataArray:
+        """Return the whole reconstruction; worked out once."""
+        with self._lock:
+            return self._timed(self._look.cube)
+
+    def blocks(
+        self, rows: slice, columns: slice, bands: slice = slice(None)
+    ) -> Iterator[np.ndarray]:
+        """Give a part of the cube in one piece."""
+        wanted = list(range(len(self.wavelength))[bands])
+        if len(wanted) < len(self.wavelength):
+            yield self._decoded(wanted)[rows, columns]
+        else:
+            with self._lock:
+                found = self._timed(self._look.spectra, rows, columns)
+            yield found
+
+    def plane(self, band: int, rows: slice, columns: slice) -> np.ndarray:
+        """Return a part of one band."""
+        return self._decoded([band])[rows, columns, 0]
+
+    def _decoded(self, bands: list[int]) -> np.ndarray:
+        """Return some bands, (H, W, bands); with those not there yet come all that are expected."""
+        with self._lock:
+            self._asked += [band for band in bands if band not in self._asked]
+            if not self._places.keys() >= set(bands):
+                new = [
+                    band
+                    for band in dict.fromkeys(self._expected + bands)
+                    if band not in self._places
+                ]
+                self._planes.append(self._timed(self._look.bands, new))
+                group = len(self._planes) - 1
+                self._places |= {band: (group, at) for at, band in enumerate(new)}
+            places = [self._places[band] for band in bands]
+        (group, first), last = places[0], places[-1][1]
+        if places == [(group, at) for at in range(first, last + 1)]:
+            return self._planes[group][..., first : last + 1]
+        return np.stack([self._planes[group][..., at] for group, at in places], -1)
+
+    def _timed(self, call: Callable, *arguments: Any) -> Any:
+        start = time.perf_counter()
+        found = call(*arguments)
+        stages = self._told["stages"]
+        stages["decode"] = stages.get("decode", 0.0) + 1000 * (time.perf_counter() - start)
+        return found
