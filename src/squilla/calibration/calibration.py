@@ -205,6 +205,13 @@ class Calibration:
         """Sensitivity at the angles of `angle`, (A, M, K), float32."""
         return torch.from_numpy(self.sensitivity).float()
 
+    @cached_property
+    def usual_moments(self) -> Tensor:
+        """Second moments of what is usually measured, (A, M, M), float64; for the broad prior."""
+        from squilla.calibration.agreement import usual_moments
+
+        return usual_moments(self)
+
     def angle_weights(self, angle: Tensor) -> Tensor:
         """Return the weights that interpolate between the angles of the sensitivity.
 

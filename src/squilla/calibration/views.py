@@ -45,7 +45,7 @@ def sub_images(raw: Raw, lattice: Lattice, pixels: Pixels, margin: int) -> SubIm
         raw.frame, pixels.bias, pixels.dark_rate, exposure, pixels.flat, pixels.valid, saturation,
         origin, image, bad, saturated,
     )  # fmt: skip
-    _fill(image, bad)
+    fill(image, bad)
     offset = lattice.centre - origin - (np.array(lattice.field) - 1) / 2 - margin
     share = float(saturated.sum() / image.size)
     return SubImages(torch.from_numpy(image), torch.from_numpy(bad), offset, margin, share)
@@ -79,7 +79,8 @@ def _correct(
 
 
 @numba.njit(parallel=True, cache=True)
-def _fill(image, bad):
+def fill(image, bad):
+    """Put the mean of its good neighbours into each bad pixel of (M, H, W) pictures."""
     units, rows, columns = image.shape
     for unit in numba.prange(units):
         for row in range(rows):
