@@ -42,6 +42,8 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     if calibration.deviations is not None:
         errors = calibration.deviations.astype(np.float32)
         variables["deviations"] = (("draw", "angle", "unit", "wavelength"), errors)
+    if calibration.white is not None:
+        variables["white"] = ("unit", calibration.white, {"long_name": "level of the flats"})
     attributes: dict = {
         "Conventions": "CF-1.11",
         "kind": _KIND,
@@ -117,6 +119,7 @@ def load_calibration(path: str | Path) -> Calibration:
             lattice,
             pixels,
             dataset["deviations"].values if "deviations" in dataset else None,
+            dataset["white"].values.astype(float) if "white" in dataset else None,
             json.loads(facts["provenance"]),
         )
 

@@ -78,7 +78,8 @@ def without_veil(raw: Raw, pixels: Pixels) -> tuple[Pixels, float]:
     -------
     pixels : Pixels
     risen : float
-        Mean rise below the sub-images, DN; 0 where there is none to speak of.
+        Mean rise below the sub-images, DN; 0 where there is none to speak of. A level far below
+        the calibrated one is another bit depth, and no wear.
     """
     blocks = pixels.dark_blocks
     blocks = blocks[:: len(blocks) // 1000 + 1]
@@ -87,7 +88,7 @@ def without_veil(raw: Raw, pixels: Pixels) -> tuple[Pixels, float]:
     level = dark_levels(raw.frame, raw.exposure, pixels, blocks)
     noise = np.sqrt((pixels.read_noise / pixels.gain) ** 2 + 1 / 12) / 8
     usual = float(np.median(level))
-    if abs(usual) < max(5 * noise / np.sqrt(len(blocks)), 0.25):
+    if usual < max(5 * noise / np.sqrt(len(blocks)), 0.25):
         return pixels, 0.0
     size = np.array(raw.frame.shape)
     where = (blocks / size * 2 - 1).T
@@ -98,7 +99,7 @@ def without_veil(raw: Raw, pixels: Pixels) -> tuple[Pixels, float]:
         left = np.abs(level - powers @ fit)
         kept = left <= 5 * np.median(left) + noise
         fit = np.linalg.lstsq(powers[kept], level[kept], rcond=None)[0]
-    smooth = np.abs(level - powers @ fit) < 0.1 * abs(usual) + 4 * np.hypot(noise, shot)
+    smooth = np.abs(level - powers @ fit) < 0.1 * usual + 4 * np.hypot(noise, shot)
     if smooth.mean() < 0.98:
         return pixels, 0.0
     y, x = (np.linspace(-1, 1, length, dtype=np.float32) for length in raw.frame.shape)
@@ -207,9 +208,9 @@ def warn_of_wear(told: dict[str, Any], signal: float, count: int) -> None:
             f"{told['odd_pixels']} pixels stick out of their neighbours, hot or dead since the "
             "calibration; they are left out. Take new dark frames."
         )
-    if abs(told["dark_risen"]) > _RISEN * signal:
+    if told["dark_risen"] > _RISEN * signal:
         says.append(
-            f"The dark level lies {told['dark_risen']:+.1f} DN beside the calibrated one, and was "
+            f"The dark level lies {told['dark_risen']:.1f} DN above the calibrated one, and was "
             "corrected: the sensor is warmer, or light leaks in."
         )
     for sentence in says:

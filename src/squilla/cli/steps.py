@@ -171,6 +171,36 @@ def calibrate(
             typer.echo(f"  left out, {name.removesuffix('_steps')}: {left_out}")
 
 
+def check(
+    calibration: Annotated[Path, typer.Argument(help="Of the camera, .nc.")],
+    dark: Annotated[Path, typer.Option(help="Today's frames without light: a file or folder.")],
+    flat: Annotated[Path, typer.Option(help="Today's flats in the calibration's lamp.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Calibration to write, mended, .nc.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare today's dark frames and flats with a calibration: dust, hot pixels, moved filters.
+
+    Example: squilla check camera.nc --dark dark --flat flat -o camera-today.nc
+    """
+    from squilla.calibration.check import check
+    from squilla.calibration.store import load_calibration
+    from squilla.files.raw import read_raws
+
+    known = load_calibration(calibration)
+    found = check(known, dark=read_raws(dark), flat=read_raws(flat))
+    if output is not None:
+        found.mended(known).save(output)
+    if as_json:
+        told = ("drift", "drift_error", "lamp", "dusty", "hot", "dark_risen")
+        figures = {name: getattr(found, name) for name in told}
+        typer.echo(json.dumps(figures | {"response": found.response.tolist(), "says": found.says}))
+        return
+    for sentence in found.says or ["Nothing has changed."]:
+        typer.echo(sentence)
+
+
 def reconstruct(
     raw: Annotated[list[Path], typer.Argument(help="Raw frames: files, TIFFs of many, folders.")],
     calibration: Annotated[Path, typer.Option(help="Of the camera, .nc.")],

@@ -134,7 +134,9 @@ def complete(
     response = calibration.sensitivities.double() if angle is not None else None
     if response is None:
         response = calibration.mean_sensitivity.double()[None]
-    covariance = (response @ second_moment(calibration.wavelength) @ response.mT).float().to(y.device)
+    covariance = (
+        (response @ second_moment(calibration.wavelength) @ response.mT).float().to(y.device)
+    )
     known = torch.where(valid, y, 0)[partial]
     noise = _noise_to_signal(None if snr is None else snr[partial], len(known), y.device)
     weights = torch.ones(len(known), 1, device=y.device)
