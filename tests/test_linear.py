@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from random_camera import smooth_camera
-from squilla.calibration.calibration import Calibration
 from squilla.calibration.agreement import model_error
+from squilla.calibration.calibration import Calibration
 from squilla.reconstruction.linear import Ridge, complete
 from squilla.spectra import broad_spectra, second_moment
 

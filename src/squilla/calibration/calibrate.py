@@ -9,6 +9,7 @@ import numpy as np
 from squilla import __version__
 from squilla.calibration.bundle import lattice_from_shots
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.check import white_levels
 from squilla.calibration.geometry import lattice_from_flat, refine_with_target
 from squilla.calibration.known import KnownScene, known_responses, sensitivity_from_spectra
 from squilla.calibration.pixels import Darks, Stack, defective, noise_of
@@ -20,7 +21,6 @@ from squilla.calibration.sensitivity import (
     sweep_sensitivity,
 )
 from squilla.calibration.stray import stray_light
-from squilla.calibration.check import white_levels
 from squilla.calibration.views import windows
 from squilla.camera.design import CameraDesign
 from squilla.camera.lens import cone

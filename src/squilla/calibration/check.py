@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from scipy.ndimage import uniform_filter
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels

@@ -10,7 +10,6 @@ import numpy as np
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 
-
 _FLICKER = 0.002
 """Change of the light from frame to frame that is evened out; noise makes less."""
 

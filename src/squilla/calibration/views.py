@@ -74,7 +74,8 @@ def _correct(
             count += over
             flags[n] = wrong
             value = (light - dark[n] - exposure * slope[n]) / share[n]
-            values[n] = np.float32(0) if wrong else value
+            # What is saturated was at least so bright.
+            values[n] = value if usable[n] else np.float32(0)
         saturated[unit, row] = count
 
 
@@ -93,7 +94,9 @@ def fill(image, bad):
                         if not bad[unit, y, x]:
                             total += image[unit, y, x]
                             count += 1
-                image[unit, row, column] = total / max(count, 1)
+                if count:
+                    mean = np.float32(total / count)
+                    image[unit, row, column] = max(mean, image[unit, row, column])
 
 
 def windows(image: np.ndarray, lattice: Lattice, margin: int) -> tuple[np.ndarray, np.ndarray]:

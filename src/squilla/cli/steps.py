@@ -4,7 +4,7 @@ import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,7 @@ from squilla.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
+    from xarray import DataArray
 
     from squilla.batch import Recipe
     from squilla.calibration.known import KnownScene
@@ -300,21 +301,42 @@ def _reconstruct_many(
 
 def evaluate(
     cube: Annotated[Path, typer.Argument(help="Reconstructed cube.")],
-    reference: Annotated[Path, typer.Option(help="Cube of the truth.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    reference: Annotated[Path | None, typer.Option(help="Cube of the truth.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for a report against the truth.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Judge a cube against a reference.
+    """Say where a cube comes from and what its pixels are worth; judge it against a reference.
 
-    Writes metrics.json and report.html.
+    With a reference, metrics.json and report.html are written.
 
-    Example: squilla evaluate cube.nc --reference truth.nc -o verdict
+    Examples: squilla evaluate cube.nc;
+    squilla evaluate cube.nc --reference truth.nc -o verdict
     """
+    from squilla.files.cube import load_cube, open_cube
+
+    if (reference is None) != (output is None):
+        raise InputError("Give a reference and a folder for the report (-o) together, or neither.")
+    opened, layers = open_cube(cube)
+    told = _worth(opened.attrs, layers)
+    metrics: dict[str, float] = {}
+    if reference is not None and output is not None:
+        metrics = _judged(cube.stem, load_cube(cube), load_cube(reference), output)
+    if as_json:
+        typer.echo(json.dumps(metrics | {"provenance": told}))
+        return
+    for name, value in metrics.items():
+        typer.echo(f"{name:<10} {value:.6g}")
+    for name, value in told.items():
+        typer.echo(f"{name:<28} {value:.6g}" if isinstance(value, float) else f"{name:<28} {value}")
+
+
+def _judged(name: str, cube: "DataArray", reference: "DataArray", output: Path) -> dict[str, float]:
     from squilla.evaluation.report import Trial, scene_section, write_report
-    from squilla.files.cube import load_cube
     from squilla.files.disk import replacing
 
-    trial = Trial(cube.stem, load_cube(reference), {"cube": load_cube(cube)})
+    trial = Trial(name, reference, {"cube": cube})
     metrics = trial.metrics["cube"]
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -322,12 +344,34 @@ def evaluate(
         raise InputError(f"The folder {output} cannot be made: {error.strerror}.") from error
     with replacing(output / "metrics.json") as temporary:
         temporary.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    write_report(output / "report.html", [scene_section(trial)], title=f"{cube.name} judged")
-    if as_json:
-        typer.echo(json.dumps(metrics))
-        return
-    for name, value in metrics.items():
-        typer.echo(f"{name:<10} {value:.6g}")
+    write_report(output / "report.html", [scene_section(trial)], title=f"{name} judged")
+    return metrics
+
+
+def _worth(attributes: dict, layers: "dict[str, DataArray]") -> dict[str, Any]:
+    """Return the provenance of a cube, and how many of its pixels are not to be believed, by why."""
+    import numpy as np
+
+    from squilla.reconstruction.judgement import Doubt
+
+    plain = (str, int, float, np.number)
+    told = {
+        str(key): value.item() if isinstance(value, np.number) else value
+        for key, value in attributes.items()
+        if key != "long_name" and isinstance(value, plain)
+    }
+    if "residual" in layers:
+        residual = layers["residual"].values
+        for share in (50, 95):
+            told[f"residual, {share} % below"] = float(np.nanpercentile(residual, share))
+    if "flags" in layers:
+        flags = layers["flags"].values.astype(int)
+        for doubt in Doubt:
+            count = int((flags & doubt > 0).sum())
+            if count:
+                told[f"{doubt.name}".lower()] = f"{count} of {flags.size} pixels: {doubt.meaning}"
+        told["believable"] = f"{(flags == 0).mean():.2%} of the pixels"
+    return told
 
 
 def read_sweep(folder: Path) -> "Iterator[SweepStep]":
