@@ -58,7 +58,8 @@ def run(target: Target, data: bytes, folder: Path) -> bool:
         try:
             target.read(path)
         except InputError as error:
-            assert str(error).strip(), "an InputError says something"
+            if not str(error).strip():
+                raise RuntimeError("an InputError without a sentence") from error
             return False
     return True
 
@@ -176,8 +177,6 @@ def _frames(path: Path) -> None:
 
 
 def _toml_design() -> list[bytes]:
-    source = Path(CameraDesign.__module__.replace(".", "/"))  # keeps the import used
-    del source
     from squilla.camera.design import design_path
 
     return [design_path("thesis").read_bytes(), design_path("mosaic-16").read_bytes()]

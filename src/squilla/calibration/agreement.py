@@ -106,9 +106,9 @@ def compare(
 
     Notes
     -----
-    The unit is left out without which the least stays unexplained, and all is looked at again, until
-    no response is off by more than 3 %. Where more than a quarter would have to go it is not for the
-    units to blame, and none is left out.
+    The unit is left out without which the least stays unexplained, and all is looked at again,
+    until no response is off by more than 3 %. Where more than a quarter would have to go the units
+    are not to blame, and none is left out.
     """
     side = max(min(y.shape[:2]) // blocks, 4)
     level, wrong, place = _blocks(y, valid, angle, side)

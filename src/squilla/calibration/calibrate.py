@@ -89,8 +89,8 @@ def calibrate(
         raise InputError(f"The frames are of different cameras: {sorted(names - {''})}.")
     if flats.light_change > 0.01:
         warnings.warn(
-            f"The light of the flats changed by {flats.light_change:.0%} from frame to frame; it was "
-            "evened out. Let the lamp warm up.",
+            f"The light of the flats changed by {flats.light_change:.0%} from frame to frame; it "
+            "was evened out. Let the lamp warm up.",
             stacklevel=2,
         )
     saturation = 0.98 * (2**design.sensor.bits - 1)

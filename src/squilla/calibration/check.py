@@ -116,7 +116,8 @@ def check(calibration: Calibration, *, dark: Iterable[Raw], flat: Iterable[Raw])
     lattice, pixels, white = calibration.lattice, calibration.pixels, calibration.white
     if lattice is None or pixels is None or white is None:
         raise InputError(
-            "This calibration keeps no flats to compare with; make it anew with `squilla calibrate`."
+            "This calibration keeps no flats to compare with; make it anew with `squilla "
+            "calibrate`."
         )
     darks = Darks.of(dark)
     flats = Stack.of(flat, "flat", darks)

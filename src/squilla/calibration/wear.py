@@ -71,8 +71,8 @@ def _find_lost(frame, lost):
 def without_veil(raw: Raw, pixels: Pixels) -> tuple[Pixels, float]:
     """Take a dark level that has risen smoothly, over the whole sensor, into the bias.
 
-    What the dark parts show is continued below the sub-images by a polynomial of fourth degree. Light
-    that does not fit one comes from the scene and is left to `squilla.calibration.stray`.
+    What the dark parts show is continued below the sub-images by a polynomial of fourth degree.
+    Light that does not fit one comes from the scene and is left to `squilla.calibration.stray`.
 
     Returns
     -------

@@ -25,6 +25,7 @@ def align(
 
     from squilla.calibration.stack import agreement, align_stack
     from squilla.files.disk import existing, reading, replacing
+    from squilla.files.tiff import read_pages
 
     try:
         rows, columns = (int(part) for part in shape.lower().split("x"))
@@ -34,7 +35,7 @@ def align(
         raise InputError(f"{output} must end in .npy or .tiff.")
     path = existing(stack)
     with reading(path, "stack of sub-images"):
-        images = np.load(path) if path.suffix == ".npy" else tifffile.imread(path)
+        images = np.load(path, mmap_mode="r") if path.suffix == ".npy" else read_pages(path)
     aligned = align_stack(images, (rows, columns), reference=reference)
     pages = np.where(aligned.valid, aligned.y, np.nan).transpose(2, 0, 1).astype(np.float32)
     with replacing(output) as temporary, temporary.open("wb") as stream:

@@ -349,7 +349,7 @@ def _judged(name: str, cube: "DataArray", reference: "DataArray", output: Path) 
 
 
 def _worth(attributes: dict, layers: "dict[str, DataArray]") -> dict[str, Any]:
-    """Return the provenance of a cube, and how many of its pixels are not to be believed, by why."""
+    """Return the provenance of a cube, and how many pixels are not to be believed, and why."""
     import numpy as np
 
     from squilla.reconstruction.judgement import Doubt
@@ -439,15 +439,15 @@ def read_depth(path: Path, shape: tuple[int, ...]):
     """Read a depth map, mm, and cut and resize it as `fitted` does the scene, (y, x) float64."""
     import numpy as np
 
-    try:
-        if path.suffix.lower() == ".npy":
-            depth = np.load(path, allow_pickle=False)
-        else:
-            import tifffile
+    from squilla.files.disk import existing, reading
+    from squilla.files.tiff import read_pages
 
-            depth = np.asarray(tifffile.imread(path))
-    except Exception as error:  # tifffile and NumPy fail on bad bytes in many ways
-        raise InputError(f"The depth map {path} cannot be read: {error}.") from error
+    with reading(existing(path), "depth map"):
+        if path.suffix.lower() == ".npy":
+            depth = np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+        else:
+            depth = read_pages(path)
+    depth = depth[0] if depth.ndim == 3 and len(depth) == 1 else depth
     if depth.ndim != 2 or depth.size == 0 or depth.dtype.kind not in "uif":
         raise InputError(f"The depth map {path} must be one picture of distances in mm.")
     if depth.shape != tuple(shape):

@@ -63,6 +63,18 @@ def _mapped(path: Path, tiff: Any) -> np.ndarray:
     if plain and all(start == flat[0] + n * first.nbytes for n, start in enumerate(flat)):
         kind = first.dtype.newbyteorder(tiff.byteorder)
         return np.memmap(path, kind, "r", flat[0], (len(flat), *first.shape))
+    return _stacked(path, tiff)
+
+
+def read_pages(path: Path) -> np.ndarray:
+    """Read a TIFF of grey pages of one size, (pages, rows, columns)."""
+    import tifffile
+
+    with reading(path, "TIFF"), tifffile.TiffFile(path) as tiff:
+        return _stacked(path, tiff)
+
+
+def _stacked(path: Path, tiff: Any) -> np.ndarray:
     return np.stack([read_page(path, page) for page in tiff.pages])
 
 

@@ -90,7 +90,7 @@ def judge(
         residual = _residual(
             x, y, valid, measurement.angle, calibration, exposure, 1 / pixels.gain, fixed
         )
-        black = float(np.median(pixels.bias))
+        black = float(np.median(pixels.bias[::16, ::16]))
         full = 0.9 * (pixels.saturation - black) / exposure
         saturated = (~valid & (y > full)).float().mean(-1) >= 0.125
         flags |= saturated * Doubt.SATURATED
@@ -116,10 +116,10 @@ def judge(
 
 
 def told_of(judged: "dict[str, DataArray]") -> dict[str, float]:
-    """Return the figures for the provenance: the usual residual, and the share of flagged pixels."""
+    """Return the figures for the provenance: usual residual and share of flagged pixels."""
     residual, flags = judged["residual"].values, judged["flags"].values
     usual = float(np.nanmedian(residual)) if np.isfinite(residual).any() else float("nan")
-    return {"residual": usual, "flagged": float((flags > 0).mean())}
+    return {"usual_residual": usual, "flagged": float((flags > 0).mean())}
 
 
 def _residual(
