@@ -2,7 +2,9 @@
 
 import json
 import os
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -223,3 +225,90 @@ def test_dask_gives_the_same_bits(night, serial, tmp_path):
         xr.open_zarr(path, consolidated=False).radiance.values for path in (serial[0], output)
     )
     np.testing.assert_array_equal(one, many)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of its own on which hardly anything fits, and a way to make it larger."""
+    place = tmp_path / "disk"
+    place.mkdir()
+
+    def mount(*options: str) -> bool:
+        command = ["mount", "-t", "tmpfs", *options, "tmpfs", str(place)]
+        return (
+            shutil.which("mount") is not None
+            and not subprocess.run(command, check=False, capture_output=True).returncode
+        )
+
+    if not mount("-o", "size=2400k"):
+        pytest.skip("a disk of its own cannot be mounted; run as root")
+    yield place, lambda: mount("-o", "remount,size=64m")
+    subprocess.run(["umount", str(place)], check=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["zarr", "folder"])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_full_disk_loses_nothing(night, serial, small_disk, kind, workers):
+    place, enlarge = small_disk
+    output = place / ("cubes.zarr" if kind == "zarr" else "cubes")
+    frames = list_frames(night / "raw")
+    with pytest.raises(InputError, match="No space left"):
+        reconstruct_all(frames, recipe(night), output, workers=workers)
+    for cube in place.rglob("*.nc"):
+        xr.load_dataset(cube).close()  # each is whole
+    before = journalled(place)
+    assert len(before) < 5
+    assert enlarge()
+    summary = reconstruct_all(frames, recipe(night), output, workers=workers)
+    assert summary.found == len(before)
+    assert sorted(journalled(place)) == sorted(summary.done)  # none twice
+    one = xr.open_zarr(serial[0], consolidated=False).radiance
+    for name in summary.done:
+        if kind == "zarr":
+            cube = xr.open_zarr(output, consolidated=False).radiance.sel(capture=name)
+        else:
+            cube = xr.load_dataset(output / f"{name}.nc").radiance
+        np.testing.assert_array_equal(cube, one.sel(capture=name))
+
+
+def journalled(place) -> list[str]:
+    """Return the names of the captures that a journal calls whole."""
+    lines = [json.loads(line) for path in place.rglob("*.jsonl") for line in path.open()]
+    return [line["name"] for line in lines if "name" in line and "failed" not in line]
+
+
+@pytest.mark.slow
+def test_the_command_with_a_scheduler_and_workers_of_their_own(night, serial, tmp_path):
+    """One film of many pages, through `dask scheduler` and two `dask worker` processes."""
+    distributed = pytest.importorskip("distributed", reason="pip install 'squilla[batch]'")
+    with tifffile.TiffWriter(tmp_path / "film.tiff") as tiff:
+        for number in range(3):
+            raw = read_raw(night / "raw" / f"shot{number}.tiff")
+            facts = {"exposure": raw.exposure, "metadata": raw.metadata}
+            tiff.write(raw.frame, description=json.dumps(facts), metadata=None)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address, quiet = f"tcp://127.0.0.1:{port}", {"stderr": subprocess.DEVNULL}
+    dask = [sys.executable, "-m", "dask"]
+    place = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+    alone = ["--nthreads", "1", "--no-dashboard", "--local-directory", str(tmp_path)]
+    processes = [subprocess.Popen([*dask, "scheduler", *place], **quiet)]
+    processes += [subprocess.Popen([*dask, "worker", address, *alone], **quiet) for _ in range(2)]
+    try:
+        with distributed.Client(address, timeout=60) as client:
+            client.wait_for_workers(2, timeout=60)
+        squilla = [sys.executable, "-c", "from squilla.cli import main; main()", "reconstruct"]
+        asked = ["--calibration", night / "camera.nc", "--distance", "300", "--scheduler", address]
+        output = tmp_path / "film.zarr"
+        subprocess.run([*squilla, tmp_path / "film.tiff", *asked, "-o", output], check=True)
+    finally:
+        for process in processes:
+            process.terminate()
+            process.wait(30)
+    many = xr.open_zarr(output, consolidated=False).radiance
+    assert many.capture.values.tolist() == [f"film-0000{number}" for number in range(3)]
+    one = xr.open_zarr(serial[0], consolidated=False).radiance
+    for number in range(3):
+        np.testing.assert_array_equal(many[number], one.sel(capture=f"shot{number}"))

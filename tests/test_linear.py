@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from random_camera import smooth_camera
+from squilla.calibration.agreement import model_error
 from squilla.calibration.calibration import Calibration
-from squilla.reconstruction.linear import Ridge, complete, model_error, second_moment
-from squilla.spectra import broad_spectra
+from squilla.reconstruction.linear import Ridge, complete
+from squilla.spectra import broad_spectra, second_moment
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +20,7 @@ def camera():
 
 @pytest.fixture(scope="module")
 def moment(camera):
-    return second_moment(camera)
+    return second_moment(camera.wavelength)
 
 
 def noisy(y, snr, generator):
@@ -80,7 +81,7 @@ def test_filled_channels_equal_channels_left_out(camera, moment):
     y = one.project(spectra)
     valid = torch.rand(y.shape, generator=generator) < 0.8
     filled = complete(torch.where(valid, y, 1e6), valid, one)
-    moment = second_moment(one)
+    moment = second_moment(one.wavelength)
     estimate = filled @ Ridge(one, moment).estimate(torch.eye(one.filters))
     response = one.mean_sensitivity.double()
     noise = 10**-2 * (response @ moment @ response.T).diagonal().mean()
@@ -110,7 +111,7 @@ def test_an_uncertain_sensitivity_is_noise_of_its_own():
     random = np.random.default_rng(1)
     drawn = 0.03 * camera.sensitivity.mean() * random.standard_normal((40, 1, 16, 51))
     unsure = replace(camera, deviations=drawn)
-    moment = second_moment(camera)
+    moment = second_moment(camera.wavelength)
     x = broad_spectra(4000, camera.wavelength, generator=torch.Generator().manual_seed(1))
     which = torch.from_numpy(random.integers(40, size=4000))
     true = camera.sensitivities[0] + torch.from_numpy(drawn[:, 0]).float()[which]

@@ -175,16 +175,21 @@ def reconstruct_one(
     Returns
     -------
     cube : DataArray, (y, x, wavelength)
-    extra : what belongs to it, such as its depth, by name
-    provenance : of the measurement
+    extra : what belongs to it, by name: what each pixel is worth, and its depth
+    provenance : of the measurement, and how well the cube explains it
     """
     from squilla.calibration.alignment import measure
+    from squilla.reconstruction.judgement import judge, told_of
 
     calibration, model = _loaded(recipe, json.dumps(recipe.state(), sort_keys=True))
     raw = frame.read()
     measurement = measure(raw, calibration, distance=recipe.distance, depth=recipe.depth)
-    extra = measurement.depth.arrays() if measurement.depth else {}
-    return model.reconstruct(measurement), extra, measurement.provenance
+    cube = model.reconstruct(measurement)
+    judged = judge(cube, measurement, calibration)
+    told = told_of(judged)
+    cube.attrs |= told
+    extra = judged | (measurement.depth.arrays() if measurement.depth else {})
+    return cube, extra, measurement.provenance | told
 
 
 def _cube(frame: Frame, recipe: Recipe) -> "tuple[xr.Dataset, dict[str, Any]]":
@@ -232,6 +237,13 @@ def _first_cube(frames: list[Frame], recipe: Recipe) -> "xr.Dataset | None":
 
 
 # --- where cubes go ---------------------------------------------------------------------------
+
+
+_SHARED = (
+    "long_name", "units", "flag_masks", "flag_meanings",
+    "model", "software", "calibration", "weights", "scale",
+)  # fmt: skip
+"""What is the same for the cubes of all captures."""
 
 
 @dataclass(frozen=True)
@@ -303,16 +315,18 @@ class _Stack:
         empty = {
             name: (
                 ("capture", *array.dims),
-                dask.array.full((count, *array.shape), np.nan, dtype=array.dtype, chunks=-1),
-                {"long_name": array.attrs.get("long_name", str(name))},
+                dask.array.full(
+                    (count, *array.shape),
+                    np.nan if array.dtype.kind == "f" else 0,
+                    dtype=array.dtype,
+                    chunks=-1,
+                ),
+                {key: array.attrs[key] for key in _SHARED if key in array.attrs},
             )
             for name, array in cube.data_vars.items()
         }
         whole = xr.Dataset(empty, {**cube.coords, "capture": np.array(self.names, object)})
         whole.attrs = {"Conventions": "CF-1.11", "cube": next(iter(empty))}
-        kept = ("model", "software", "calibration", "scale")
-        first = cube[next(iter(empty))].attrs
-        whole[next(iter(empty))].attrs |= {key: first[key] for key in kept if key in first}
         encoding = zarr_encoding(whole)
         with stop_on_disk_error(self.path):
             # Over what a run that was killed here has begun.

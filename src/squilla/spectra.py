@@ -6,7 +6,7 @@ sensitivity R = transmittance x quantum efficiency and no further factor.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files as package_files
 from typing import TYPE_CHECKING, Literal
 
@@ -300,6 +300,23 @@ def broad_spectra(
         line_spectra(line, wavelength, generator=generator),
     ]
     return torch.cat(parts)[torch.randperm(count, generator=generator)]
+
+
+def second_moment(wavelength: np.ndarray) -> "Tensor":
+    """Return the mean of x x' over 20 000 spectra of the broad prior, (K, K), float64.
+
+    Outside 500-750 nm its natural spectra are stretched; see `natural_spectra`.
+    """
+    return _second_moment(tuple(np.asarray(wavelength, float).tolist()))
+
+
+@lru_cache(maxsize=4)  # every capture needs it
+def _second_moment(wavelength: tuple[float, ...]) -> "Tensor":
+    import torch
+
+    generator = torch.Generator().manual_seed(0)
+    spectra = broad_spectra(20_000, np.array(wavelength), generator=generator)
+    return (spectra.T @ spectra).double() / len(spectra)
 
 
 PRIORS: dict[str, Callable[..., "Tensor"]] = {

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from squilla.calibration.agreement import compare
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.depth import Depth, find_depth
 from squilla.calibration.disparity import find_plane, fit_plane, plane_map
@@ -16,6 +17,14 @@ from squilla.calibration.quality import COSTLY, STALE, colour_error, drift, misa
 from squilla.calibration.resample import SINC, resample
 from squilla.calibration.stray import stray_light
 from squilla.calibration.views import SubImages, evened, inner, sub_images
+from squilla.calibration.wear import (
+    told_of,
+    warn_of_wear,
+    without_covered_units,
+    without_lost_rows,
+    without_odd_pixels,
+    without_veil,
+)
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 
@@ -136,15 +145,18 @@ def measure(
         before = fit_plane(start.disparity.numpy())
         largest = min(largest, float(np.abs(before).sum()) + _DRIFT)
     margin = int(np.ceil(largest * np.abs(lattice.baseline).max())) + _TAPS
+    pixels, lost = without_lost_rows(raw, pixels)
+    pixels, risen = without_veil(raw, pixels)
     views = sub_images(raw, lattice, pixels, margin)
     snr = _judge(views, raw, pixels)
+    views, odd = without_odd_pixels(views, pixels)
     noise = _noise_variance(views, pixels)
     relief, seen = None, True
     if distance is not None:
         disparity = np.full(lattice.field, lattice.disparity(distance), np.float32)
         quality = {"alignment": "from the given distance", "alignment_score": 1.0}
     else:
-        even = evened(views, lattice, calibration)
+        even = evened(without_covered_units(views), lattice, calibration)
         plane, offset, quality = place(
             even, lattice, largest, noise=noise, start=before, refine=refine
         )
@@ -158,17 +170,23 @@ def measure(
             score = float(relief.confident.float().mean())
             quality = {"alignment": "a distance for every point", "alignment_score": score}
     y, valid = align(views, lattice, disparity)
+    valid = valid & torch.as_tensor(seen)
+    angle = torch.from_numpy(lattice.field_angle()).float()
+    agreement = compare(y, valid, angle, calibration, pixels)
+    valid[..., torch.from_numpy(agreement.worn)] = False
     snr_of_point = pointwise_snr(y, pixels)
     signal = float(y.mean())
     if "misalignment" in quality:
         quality["colour_error"] = colour_error(y, noise, quality["misalignment"])
         _warn(quality)
+    worn = told_of(lost, risen, odd, agreement)
+    warn_of_wear(worn, signal, y.numel())
     y /= raw.exposure or 1.0
     typical = float(np.median(disparity))
     return Measurement(
         y,
-        valid & torch.as_tensor(seen),
-        torch.from_numpy(lattice.field_angle()).float(),
+        valid,
+        angle,
         torch.from_numpy(disparity),
         snr_of_point,
         {
@@ -179,6 +197,7 @@ def measure(
             "disparity": typical,
             "distance": lattice.distance(typical),
             **quality,
+            **worn,
             **stray_light(raw.frame, raw.exposure, pixels, signal),
         },
         relief,

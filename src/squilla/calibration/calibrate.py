@@ -1,5 +1,6 @@
 """The whole calibration: from frames of a camera to one `Calibration`."""
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ import numpy as np
 from squilla import __version__
 from squilla.calibration.bundle import lattice_from_shots
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.check import white_levels
 from squilla.calibration.geometry import lattice_from_flat, refine_with_target
 from squilla.calibration.known import KnownScene, known_responses, sensitivity_from_spectra
 from squilla.calibration.pixels import Darks, Stack, defective, noise_of
@@ -75,7 +77,7 @@ def calibrate(
     if (sweep is None) == (known is None):
         raise InputError("Give either a narrow-band sweep or known scenes, to learn R from.")
     darks = Darks.of(dark)
-    flats = Stack.of(flat, "flat")
+    flats = Stack.of(flat, "flat", darks)
     if darks.bias.shape != design.sensor_shape or flats.mean.shape != design.sensor_shape:
         raise InputError(
             f"The frames have {darks.bias.shape} and {flats.mean.shape} px, the design "
@@ -85,6 +87,12 @@ def calibrate(
     names |= {str(target.metadata.get("camera", ""))} if target is not None else set()
     if len(names - {""}) > 1:
         raise InputError(f"The frames are of different cameras: {sorted(names - {''})}.")
+    if flats.light_change > 0.01:
+        warnings.warn(
+            f"The light of the flats changed by {flats.light_change:.0%} from frame to frame; it "
+            "was evened out. Let the lamp warm up.",
+            stacklevel=2,
+        )
     saturation = 0.98 * (2**design.sensor.bits - 1)
     light = flats.mean - darks.at(flats.exposure)
     lattice = lattice_from_flat(light, design)
@@ -126,6 +134,7 @@ def calibrate(
         spectral,
         lattice=lattice,
         pixels=pixels,
+        white=white_levels(light, lattice, pixels) / (flats.exposure or 1.0),
         provenance={
             "software": f"squilla {__version__}",
             "design": design.name,
@@ -133,6 +142,7 @@ def calibrate(
             **spectral.provenance,
             **aligned,
             **stray_light(flats.mean, flats.exposure, pixels, signal),
+            "light_change": flats.light_change,
             "bad_pixels": int((~windows(valid, lattice, 0)[1]).sum()),
         },
     )

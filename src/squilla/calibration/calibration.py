@@ -125,6 +125,7 @@ class Calibration:
     lattice, pixels : None when only a response matrix is known.
     deviations : (J, A, M, K) draws of the sensitivity's error, in its unit: sensitivity +
         deviations[j] explains the calibration's frames as well. None where nothing is known of it.
+    white : (M,) DN per ms that each unit showed of the lamp of the flats; None where unknown.
     provenance : what it was made from; plain numbers and strings.
     """
 
@@ -134,6 +135,7 @@ class Calibration:
     lattice: Lattice | None = None
     pixels: Pixels | None = None
     deviations: np.ndarray | None = None
+    white: np.ndarray | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -204,6 +206,13 @@ class Calibration:
     def sensitivities(self) -> Tensor:
         """Sensitivity at the angles of `angle`, (A, M, K), float32."""
         return torch.from_numpy(self.sensitivity).float()
+
+    @cached_property
+    def usual_moments(self) -> Tensor:
+        """Second moments of what is usually measured, (A, M, M), float64; for the broad prior."""
+        from squilla.calibration.agreement import usual_moments
+
+        return usual_moments(self)
 
     def angle_weights(self, angle: Tensor) -> Tensor:
         """Return the weights that interpolate between the angles of the sensitivity.
@@ -323,6 +332,25 @@ class Calibration:
         from squilla.calibration.store import save_calibration
 
         save_calibration(self, path)
+
+    def drifted(self, shift: float) -> "Calibration":
+        """Return the calibration with all filters `shift` nm to the red of where they were.
+
+        What `squilla.calibration.check` finds is taken into account so. At the ends of the band the
+        sensitivity goes on evenly.
+        """
+        place = np.clip(self.wavelength - shift, self.wavelength[0], self.wavelength[-1])
+        right = np.clip(np.searchsorted(self.wavelength, place), 1, len(place) - 1)
+        step = self.wavelength[right] - self.wavelength[right - 1]
+        share = (place - self.wavelength[right - 1]) / step
+        moved = [
+            None
+            if table is None
+            else table[..., right - 1] * (1 - share) + table[..., right] * share
+            for table in (self.sensitivity, self.deviations)
+        ]
+        assert moved[0] is not None
+        return replace(self, sensitivity=moved[0], deviations=moved[1])
 
     def on(self, wavelength: np.ndarray) -> "Calibration":
         """Return the same calibration on another wavelength grid within its own."""

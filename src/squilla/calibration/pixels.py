@@ -10,6 +10,9 @@ import numpy as np
 from squilla.errors import InputError
 from squilla.files.raw import Raw
 
+_FLICKER = 0.002
+"""Change of the light from frame to frame that is evened out; noise makes less."""
+
 
 @dataclass(frozen=True)
 class Stack:
@@ -19,28 +22,43 @@ class Stack:
     variance : (rows, columns) float32, DN^2, from frame to frame; None for one frame.
     exposure : ms; None if unknown.
     camera : as the frames name it.
+    light_change : largest change of the light against the first frame, which was evened out.
     """
 
     mean: np.ndarray
     variance: np.ndarray | None
     exposure: float | None
     camera: str
+    light_change: float = 0.0
 
     @classmethod
-    def of(cls, raws: Iterable[Raw], kind: str) -> "Stack":
+    def of(cls, raws: Iterable[Raw], kind: str, darks: "Darks | None" = None) -> "Stack":
         """Average frames one by one, so that memory holds no more than one.
+
+        Parameters
+        ----------
+        raws : iterable of Raw
+        kind : str
+            What they are, for messages.
+        darks : Darks, optional
+            For lit frames: each is then brought to the light of the first, where it differs from it
+            by more than noise does. A lamp that flickers would pass for shot noise.
 
         Raises
         ------
         InputError
             If there is no frame, or they differ in size or exposure.
         """
-        count, first, exposure, camera = 0, None, None, ""
+        count, first, exposure, camera, change = 0, None, None, "", 0.0
+        dark = level = np.float32(0)
         total = squares = np.zeros((0, 0), np.float32)
         for raw in raws:
             if first is None:  # what is summed is the small difference to it: float32 is enough
                 first, exposure = raw.frame, raw.exposure
                 total, squares = np.zeros((2, *first.shape), np.float32)
+                if darks is not None:
+                    dark = darks.at(exposure)
+                    level = _level(first, dark)
             if raw.frame.shape != first.shape:
                 raise InputError(
                     f"The {kind} frames differ in size: {first.shape} and {raw.frame.shape}."
@@ -50,7 +68,13 @@ class Stack:
                     f"The {kind} frames differ in exposure, {exposure} and {raw.exposure} ms; give "
                     "only those of one."
                 )
-            _accumulate(raw.frame, first, total, squares)
+            here = 1.0 if darks is None else _level(raw.frame, dark) / level
+            if abs(here - 1) > _FLICKER:
+                change = max(change, abs(here - 1))
+                even = (raw.frame - dark) / np.float32(max(here, 0.01)) + dark
+                _accumulate(even, first, total, squares)
+            else:
+                _accumulate(raw.frame, first, total, squares)
             count += 1
             camera = str(raw.metadata.get("camera", ""))
         if first is None:
@@ -59,7 +83,13 @@ class Stack:
         variance = None
         if count > 1:
             variance = np.asarray((squares - count * mean**2) / (count - 1))
-        return cls(first + mean, variance, exposure, camera)
+        return cls(first + mean, variance, exposure, camera, change)
+
+
+def _level(frame: np.ndarray, dark: np.ndarray) -> float:
+    """Return the mean light of a frame, DN."""
+    few = (slice(None, None, 3), slice(None, None, 3))
+    return max(float((frame[few] - dark[few]).mean(dtype=float)), 1e-3)
 
 
 @numba.njit(parallel=True, cache=True)

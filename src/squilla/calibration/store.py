@@ -2,13 +2,14 @@
 
 import json
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 import xarray as xr
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.errors import InputError
-from squilla.files.disk import existing, reading, replacing
+from squilla.files.disk import check_size, existing, reading, replacing
 
 _KIND = "squilla calibration"
 _FRAMES = ("bias", "dark_rate", "flat")
@@ -42,6 +43,8 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     if calibration.deviations is not None:
         errors = calibration.deviations.astype(np.float32)
         variables["deviations"] = (("draw", "angle", "unit", "wavelength"), errors)
+    if calibration.white is not None:
+        variables["white"] = ("unit", calibration.white, {"long_name": "level of the flats"})
     attributes: dict = {
         "Conventions": "CF-1.11",
         "kind": _KIND,
@@ -64,6 +67,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
         for name in ("saturation", "gain", "read_noise"):
             attributes[f"pixels_{name}"] = float(getattr(pixels, name))
     dataset = xr.Dataset(variables, attrs=attributes)
+    dataset.attrs["checksum"] = _digest(dataset)
     with replacing(path) as temporary:
         dataset.to_netcdf(temporary, engine="h5netcdf", encoding=dict.fromkeys(variables, checked))
 
@@ -81,13 +85,21 @@ def load_calibration(path: str | Path) -> Calibration:
         If the file is missing, damaged, or no calibration.
     """
     path = existing(path)
-    with reading(path, "calibration"), xr.open_dataset(path, engine="h5netcdf") as dataset:
-        facts = dataset.attrs
+    with (
+        reading(path, "calibration"),
+        xr.open_dataset(path, engine="h5netcdf", mask_and_scale=False) as packed,
+    ):
+        facts = packed.attrs
+        stated = facts.pop("checksum", None)
         if facts.get("kind") != _KIND:
             raise InputError(
                 f"{path} is no calibration; make one with `squilla calibrate` or "
                 "Calibration.from_sensitivity(...).save(...)."
             )
+        check_size(path, sum(each.nbytes for each in packed.variables.values()))
+        if stated is not None and stated != _digest(packed):
+            raise InputError(f"{path} is damaged: it is not what its checksum says; copy it again.")
+        dataset = xr.decode_cf(packed, decode_times=False)
         lattice = pixels = None
         if "centre" in dataset:
             lattice = Lattice(
@@ -117,8 +129,25 @@ def load_calibration(path: str | Path) -> Calibration:
             lattice,
             pixels,
             dataset["deviations"].values if "deviations" in dataset else None,
+            dataset["white"].values.astype(float) if "white" in dataset else None,
             json.loads(facts["provenance"]),
         )
+
+
+def _digest(dataset: xr.Dataset) -> str:
+    """Return a checksum of all values as they are stored, and of all that is said about them."""
+    total = 0
+    parts = [("", dataset.attrs, None)]
+    parts += [(str(name), each.attrs, each) for name, each in sorted(dataset.variables.items())]
+    for name, attributes, values in parts:
+        told = {key: np.asarray(value).tolist() for key, value in attributes.items()}
+        told.pop("_FillValue", None)  # written by xarray
+        total = crc32(json.dumps([name, told], sort_keys=True).encode(), total)
+        if values is not None:
+            stored = np.ascontiguousarray(values.values)
+            total = crc32(f"{stored.dtype.str[1:]} {stored.shape}".encode(), total)
+            total = crc32(stored.reshape(-1).view(np.uint8), total)
+    return f"{total:08x}"
 
 
 def _pair(values: np.ndarray) -> tuple[int, int]:

@@ -40,11 +40,10 @@ def stray_light(
     blocks = pixels.dark_blocks
     if not len(blocks):
         return {"stray_light": "not judged: the sub-images leave no part of the sensor dark"}
-    level = np.empty(len(blocks), np.float32)
-    _levels(frame, pixels.bias, pixels.dark_rate, np.float32(exposure or 0.0), blocks, level)
+    level = dark_levels(frame, exposure, pixels, blocks)
     signal = max(signal, 1e-3)  # DN; of a frame that shows no picture at all
     share, peak = float(level.mean()) / signal, float(level.max()) / signal
-    noise = np.sqrt((pixels.read_noise / pixels.gain) ** 2 + 1 / 12) / _BLOCK / signal
+    noise = 1.25 * np.sqrt((pixels.read_noise / pixels.gain) ** 2 + 1 / 12) / _BLOCK / signal
     found = {"stray_share": share, "stray_peak": peak}
     if max(share, peak - 8 * noise) < _SHARE:
         return found | {"stray_light": "none seen"}
@@ -55,16 +54,24 @@ def stray_light(
     }
 
 
+def dark_levels(
+    frame: np.ndarray, exposure: float | None, pixels: Pixels, blocks: np.ndarray
+) -> np.ndarray:
+    """Return by how much blocks, (N, 2) px, lie above the calibrated dark, (N,) DN."""
+    level = np.empty(len(blocks), np.float32)
+    _levels(frame, pixels.bias, pixels.dark_rate, np.float32(exposure or 0.0), blocks, level)
+    return level
+
+
 @numba.njit(parallel=True, cache=True, fastmath=True)
 def _levels(frame, bias, dark_rate, exposure, blocks, level):
     for number in numba.prange(len(blocks)):
         y, x = blocks[number]
-        total, highest = np.float32(0), np.float32(0)
-        for row in range(y, y + _BLOCK):
+        mean = np.empty(_BLOCK, np.float32)
+        for row in range(_BLOCK):
+            total = np.float32(0)
             for column in range(x, x + _BLOCK):
-                value = np.float32(frame[row, column])
-                total += value
-                highest = max(highest, value)
-        # Without the brightest pixel, which may be a hot one; dark parts have one dark level.
-        dark = bias[y, x] + exposure * dark_rate[y, x]
-        level[number] = (total - highest) / (_BLOCK * _BLOCK - 1) - dark
+                total += np.float32(frame[y + row, column])
+            mean[row] = total / _BLOCK
+        # Not the mean: some rows may hold hot pixels. Dark parts have one dark level.
+        level[number] = np.median(mean) - bias[y, x] - exposure * dark_rate[y, x]

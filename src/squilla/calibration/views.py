@@ -45,7 +45,7 @@ def sub_images(raw: Raw, lattice: Lattice, pixels: Pixels, margin: int) -> SubIm
         raw.frame, pixels.bias, pixels.dark_rate, exposure, pixels.flat, pixels.valid, saturation,
         origin, image, bad, saturated,
     )  # fmt: skip
-    _fill(image, bad)
+    fill(image, bad)
     offset = lattice.centre - origin - (np.array(lattice.field) - 1) / 2 - margin
     share = float(saturated.sum() / image.size)
     return SubImages(torch.from_numpy(image), torch.from_numpy(bad), offset, margin, share)
@@ -74,12 +74,14 @@ def _correct(
             count += over
             flags[n] = wrong
             value = (light - dark[n] - exposure * slope[n]) / share[n]
-            values[n] = np.float32(0) if wrong else value
+            # What is saturated was at least so bright.
+            values[n] = value if usable[n] else np.float32(0)
         saturated[unit, row] = count
 
 
 @numba.njit(parallel=True, cache=True)
-def _fill(image, bad):
+def fill(image, bad):
+    """Put the mean of its good neighbours into each bad pixel of (M, H, W) pictures."""
     units, rows, columns = image.shape
     for unit in numba.prange(units):
         for row in range(rows):
@@ -92,7 +94,9 @@ def _fill(image, bad):
                         if not bad[unit, y, x]:
                             total += image[unit, y, x]
                             count += 1
-                image[unit, row, column] = total / max(count, 1)
+                if count:
+                    mean = np.float32(total / count)
+                    image[unit, row, column] = max(mean, image[unit, row, column])
 
 
 def windows(image: np.ndarray, lattice: Lattice, margin: int) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,7 @@ def align(
     from squilla.calibration.stack import agreement, align_stack
     from squilla.cli.checks import check_file
     from squilla.files.disk import existing, reading, replacing
+    from squilla.files.tiff import read_pages
 
     try:
         rows, columns = (int(part) for part in shape.lower().split("x"))
@@ -37,7 +38,7 @@ def align(
     path = existing(stack)
     with reading(path, "stack of sub-images"):
         npy = path.suffix.lower() == ".npy"
-        images = np.load(path) if npy else tifffile.imread(path)
+        images = np.load(path, mmap_mode="r") if npy else read_pages(path)
     aligned = align_stack(images, (rows, columns), reference=reference)
     pages = np.where(aligned.valid, aligned.y, np.nan).transpose(2, 0, 1).astype(np.float32)
     with replacing(output) as temporary, temporary.open("wb") as stream:

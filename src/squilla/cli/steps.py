@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,6 +13,7 @@ from squilla.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
+    from xarray import DataArray
 
     from squilla.batch import Recipe
     from squilla.calibration.known import KnownScene
@@ -183,6 +184,36 @@ def calibrate(
             typer.echo(f"  left out, {name.removesuffix('_steps')}: {left_out}")
 
 
+def check(
+    calibration: Annotated[Path, typer.Argument(help="Of the camera, .nc.")],
+    dark: Annotated[Path, typer.Option(help="Today's frames without light: a file or folder.")],
+    flat: Annotated[Path, typer.Option(help="Today's flats in the calibration's lamp.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Calibration to write, mended, .nc.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare today's dark frames and flats with a calibration: dust, hot pixels, moved filters.
+
+    Example: squilla check camera.nc --dark dark --flat flat -o camera-today.nc
+    """
+    from squilla.calibration.check import check
+    from squilla.calibration.store import load_calibration
+    from squilla.files.raw import read_raws
+
+    known = load_calibration(calibration)
+    found = check(known, dark=read_raws(dark), flat=read_raws(flat))
+    if output is not None:
+        found.mended(known).save(output)
+    if as_json:
+        told = ("drift", "drift_error", "lamp", "dusty", "hot", "dark_risen")
+        figures = {name: getattr(found, name) for name in told}
+        typer.echo(json.dumps(figures | {"response": found.response.tolist(), "says": found.says}))
+        return
+    for sentence in found.says or ["Nothing has changed."]:
+        typer.echo(sentence)
+
+
 def reconstruct(
     raw: Annotated[list[Path], typer.Argument(help="Raw frames: files, TIFFs of many, folders.")],
     calibration: Annotated[Path, typer.Option(help="Of the camera, .nc.")],
@@ -286,39 +317,85 @@ def _reconstruct_many(
 
 def evaluate(
     cube: Annotated[Path, typer.Argument(help="Reconstructed cube.")],
-    reference: Annotated[Path, typer.Option(help="Cube of the truth.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    reference: Annotated[Path | None, typer.Option(help="Cube of the truth.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for a report against the truth.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Judge a cube against a reference.
+    """Say where a cube comes from and what its pixels are worth; judge it against a reference.
 
-    The reference is brought onto the wavelengths of the cube. Writes metrics.json and report.html.
+    With a reference, which is brought onto the wavelengths of the cube, metrics.json and
+    report.html are written.
 
-    Example: squilla evaluate cube.nc --reference truth.nc -o verdict
+    Examples: squilla evaluate cube.nc;
+    squilla evaluate cube.nc --reference truth.nc -o verdict
     """
+    from squilla.files.cube import load_cube, open_cube
+
+    if (reference is None) != (output is None):
+        raise InputError("Give a reference and a folder for the report (-o) together, or neither.")
+    opened, layers = open_cube(cube)
+    told = _worth(opened.attrs, layers)
+    metrics: dict[str, float | None] = {}
+    if reference is not None and output is not None:
+        metrics = _judged(cube.stem, load_cube(cube), load_cube(reference), output)
+    if as_json:
+        typer.echo(json.dumps(metrics | {"provenance": told}))
+        return
+    for name, value in metrics.items():
+        typer.echo(f"{name:<10} {'undefined' if value is None else f'{value:.6g}'}")
+    for name, value in told.items():
+        typer.echo(f"{name:<28} {value:.6g}" if isinstance(value, float) else f"{name:<28} {value}")
+
+
+def _judged(
+    name: str, cube: "DataArray", reference: "DataArray", output: Path
+) -> dict[str, float | None]:
+    """Write a report of a cube against its reference, and return the metrics."""
     from squilla.cli.checks import make_folder
     from squilla.evaluation.report import Trial, scene_section, write_report
-    from squilla.files.cube import labelled, load_cube
+    from squilla.files.cube import labelled
     from squilla.files.disk import replacing
     from squilla.spectra import resample
 
-    estimate, truth = load_cube(cube), load_cube(reference)
-    own, wanted = (each["wavelength"].values for each in (truth, estimate))
-    truth = labelled(resample(truth.values, own, wanted), wanted, attributes=truth.attrs)
-    trial = Trial(cube.stem, truth, {"cube": estimate})
-    metrics = {  # JSON knows no number for what is infinite or undefined
-        name: value if math.isfinite(value) else None
-        for name, value in trial.metrics["cube"].items()
-    }
+    own, wanted = (each["wavelength"].values for each in (reference, cube))
+    truth = labelled(resample(reference.values, own, wanted), wanted, attributes=reference.attrs)
+    trial = Trial(name, truth, {"cube": cube})
+    metrics = trial.metrics["cube"]
+    # JSON knows no number for what is infinite or undefined.
+    kept = {key: value if math.isfinite(value) else None for key, value in metrics.items()}
     make_folder(output)
     with replacing(output / "metrics.json") as temporary:
-        temporary.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    write_report(output / "report.html", [scene_section(trial)], title=f"{cube.name} judged")
-    if as_json:
-        typer.echo(json.dumps(metrics))
-        return
-    for name, value in trial.metrics["cube"].items():
-        typer.echo(f"{name:<10} {value:.6g}")
+        temporary.write_text(json.dumps(kept, indent=2) + "\n", encoding="utf-8")
+    write_report(output / "report.html", [scene_section(trial)], title=f"{name} judged")
+    return kept
+
+
+def _worth(attributes: dict, layers: "dict[str, DataArray]") -> dict[str, Any]:
+    """Return the provenance of a cube, and how many pixels are not to be believed, and why."""
+    import numpy as np
+
+    from squilla.reconstruction.judgement import Doubt
+
+    plain = (str, int, float, np.number)
+    told = {
+        str(key): value.item() if isinstance(value, np.number) else value
+        for key, value in attributes.items()
+        if key != "long_name" and isinstance(value, plain)
+    }
+    if "residual" in layers:
+        residual = layers["residual"].values
+        for share in (50, 95):
+            told[f"residual, {share} % below"] = float(np.nanpercentile(residual, share))
+    if "flags" in layers:
+        flags = layers["flags"].values.astype(int)
+        for doubt in Doubt:
+            count = int((flags & doubt > 0).sum())
+            if count:
+                told[f"{doubt.name}".lower()] = f"{count} of {flags.size} pixels: {doubt.meaning}"
+        told["believable"] = f"{(flags == 0).mean():.2%} of the pixels"
+    return told
 
 
 def read_sweep(folder: Path) -> "Iterator[SweepStep]":
@@ -387,14 +464,14 @@ def read_depth(path: Path, shape: tuple[int, ...]) -> "np.ndarray":
     import numpy as np
 
     from squilla.files.disk import existing, reading
+    from squilla.files.tiff import read_pages
 
     with reading(existing(path), "depth map"):
         if path.suffix.lower() == ".npy":
-            depth = np.load(path, allow_pickle=False)
+            depth = np.array(np.load(path, mmap_mode="r", allow_pickle=False))
         else:
-            import tifffile
-
-            depth = np.asarray(tifffile.imread(path))
+            depth = read_pages(path)
+    depth = depth[0] if depth.ndim == 3 and len(depth) == 1 else depth
     if depth.ndim != 2 or depth.size == 0 or depth.dtype.kind not in "uif":
         raise InputError(f"The depth map {path} must be one picture of distances in mm.")
     if depth.shape != tuple(shape):

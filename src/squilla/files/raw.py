@@ -11,6 +11,7 @@ import numpy as np
 
 from squilla.errors import InputError
 from squilla.files.disk import check_size, existing, reading, replacing
+from squilla.files.tiff import read_page
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +57,7 @@ class Frame:
 
         with reading(self.path, "TIFF"), tifffile.TiffFile(self.path) as tiff:
             page = tiff.pages[self.page]
-            check_size(self.path, page.nbytes)
-            frame, facts = page.asarray(), _described(getattr(page, "description", ""))
+            frame, facts = read_page(self.path, page), _described(getattr(page, "description", ""))
         return _raw(self.path, frame, facts)
 
 
@@ -195,8 +195,7 @@ def _read_tiff(path: Path) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
         if not len(tiff.pages):
             raise InputError(f"{path} holds no picture; it may be cut short.")
         for page in tiff.pages:
-            check_size(path, page.nbytes)
-            yield page.asarray(), _described(getattr(page, "description", ""))
+            yield read_page(path, page), _described(getattr(page, "description", ""))
 
 
 def _described(description: str) -> dict[str, Any]:

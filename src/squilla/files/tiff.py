@@ -63,4 +63,33 @@ def _mapped(path: Path, tiff: Any) -> np.ndarray:
     if plain and all(start == flat[0] + n * first.nbytes for n, start in enumerate(flat)):
         kind = first.dtype.newbyteorder(tiff.byteorder)
         return np.memmap(path, kind, "r", flat[0], (len(flat), *first.shape))
-    return np.stack([page.asarray() for page in tiff.pages])
+    return _stacked(path, tiff)
+
+
+def read_pages(path: Path) -> np.ndarray:
+    """Read a TIFF of grey pages of one size, (pages, rows, columns)."""
+    import tifffile
+
+    with reading(path, "TIFF"), tifffile.TiffFile(path) as tiff:
+        return _stacked(path, tiff)
+
+
+def _stacked(path: Path, tiff: Any) -> np.ndarray:
+    return np.stack([read_page(path, page) for page in tiff.pages])
+
+
+def read_page(path: Path, page: Any) -> np.ndarray:
+    """Read a page of a TIFF whose header does not promise more than the file can hold.
+
+    Raises
+    ------
+    InputError
+        If it does: damaged headers promise millions of strips.
+    """
+    check_size(path, page.nbytes)
+    strips, listed = int(np.prod(page.chunked)), len(page.dataoffsets)
+    if strips != listed:
+        raise InputError(
+            f"{path} is damaged: its header tells of {strips:,} strips and lists {listed:,}."
+        )
+    return page.asarray()

@@ -13,6 +13,7 @@ from squilla.calibration.alignment import Measurement
 from squilla.live.answer import Answers
 from squilla.reconstruction.reconstructor import Reconstructor
 
+
 class Look:
     """Works out of a measurement what is asked for: some bands, some spectra, or the whole cube.
 

@@ -10,7 +10,6 @@ Pictures are (B, H, W, channels); level l has cells of 2^l px.
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -287,7 +286,8 @@ class Compound(Reconstructor):
         valid = torch.as_tensor(measurement.valid, dtype=torch.bool) & y.isfinite()
         enough = valid.sum(-1) >= (y.shape[-1] + 1) // 2
         channels = valid[enough].float().mean(0) >= 0.5
-        part = replace(self.calibration, sensitivity=self.calibration.sensitivity[:, channels])
+        known = self.calibration
+        part = Calibration(known.wavelength, known.sensitivity[:, channels], known.angle)
         y = complete(y[..., channels], valid[..., channels], part, angle, snr)
         y = torch.where(enough[..., None], y, torch.nan).to(self.basis.device)
         return y, angle, snr, tuple(channels.tolist())

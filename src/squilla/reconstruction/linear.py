@@ -2,16 +2,16 @@
 
 from collections.abc import Sequence
 from copy import copy
-from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from squilla.calibration.agreement import model_error
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.reconstruction.reconstructor import Reconstructor
-from squilla.spectra import broad_spectra
+from squilla.spectra import second_moment
 
 SNR = 20.0
 """Signal-to-noise ratio assumed where none is known, dB: what the thesis found for its camera."""
@@ -46,7 +46,7 @@ class Ridge(Reconstructor):
 
     def __init__(self, calibration: Calibration, moment: Tensor | None = None):
         super().__init__(calibration)
-        moment = second_moment(calibration) if moment is None else moment
+        moment = second_moment(calibration.wavelength) if moment is None else moment
         response = calibration.sensitivities.double()
         response = torch.cat([response, calibration.mean_sensitivity.double()[None]])
         signal = response @ moment @ response.mT + model_error(calibration, moment)
@@ -90,7 +90,7 @@ def levelling(calibration: Calibration) -> Tensor:
     -------
     Tensor, (A, M, M), float32; for noise of 30 dB, which serves 20 to 40
     """
-    moment = second_moment(calibration)
+    moment = second_moment(calibration.wavelength)
     response, mean = calibration.sensitivities.double(), calibration.mean_sensitivity.double()
     signal = response @ moment @ response.mT
     one = torch.eye(calibration.filters, dtype=torch.float64)
@@ -99,52 +99,12 @@ def levelling(calibration: Calibration) -> Tensor:
     return (one - (response - mean) @ estimator).float()
 
 
-def model_error(calibration: Calibration, moment: Tensor) -> Tensor:
-    """Return what the uncertainty of the sensitivity adds to measurements, as a second moment.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    moment : Tensor, (K, K), float64
-        Second moment of the spectra.
-
-    Returns
-    -------
-    Tensor, (A + 1, M, M), float64
-        The mean of (dR x)(dR x)' over the draws of the error dR, at each field angle and, last, for
-        the mean sensitivity; zero where the calibration does not know its errors.
-    """
-    filters = calibration.filters
-    total = torch.zeros(len(calibration.angle) + 1, filters, filters, dtype=torch.float64)
-    if calibration.deviations is None:
-        return total
-    for draw in torch.from_numpy(calibration.deviations).double():
-        error = torch.cat([draw, draw.mean(0, keepdim=True)])
-        total += error @ moment @ error.mT
-    return total / len(calibration.deviations)
-
-
 def _noise_to_signal(snr: Tensor | None, count: int, device: torch.device) -> Tensor:
     """Return the ratio of noise to signal power of each pixel, (N,); 20 dB where it is unknown."""
     if snr is None:
         return torch.full((count,), 10 ** (-SNR / 10), device=device)
     # Beyond 90 dB the rounding of float32 is the noise.
     return 10 ** (-snr.clamp_max(90.0) / 10)
-
-
-def second_moment(calibration: Calibration) -> Tensor:
-    """Return the mean of x x' over 20 000 spectra of the broad prior, (K, K), float64.
-
-    Outside 500-750 nm its natural spectra are stretched; see `natural_spectra`.
-    """
-    return _second_moment(tuple(calibration.wavelength.tolist()))
-
-
-@lru_cache(maxsize=4)  # every capture with an invalid pixel needs it
-def _second_moment(wavelength: tuple[float, ...]) -> Tensor:
-    generator = torch.Generator().manual_seed(0)
-    spectra = broad_spectra(20_000, np.array(wavelength), generator=generator)
-    return (spectra.T @ spectra).double() / len(spectra)
 
 
 def complete(
@@ -191,7 +151,9 @@ def complete(
     response = calibration.sensitivities.double() if angle is not None else None
     if response is None:
         response = calibration.mean_sensitivity.double()[None]
-    covariance = (response @ second_moment(calibration) @ response.mT).float().to(y.device)
+    covariance = (
+        (response @ second_moment(calibration.wavelength) @ response.mT).float().to(y.device)
+    )
     known = torch.where(valid, y, 0)[partial]
     noise = _noise_to_signal(None if snr is None else snr[partial], len(known), y.device)
     weights = torch.ones(len(known), 1, device=y.device)

@@ -220,6 +220,7 @@ class Reconstructor(nn.Module):
             "model": self.name,
             "software": f"squilla {__version__}",
             "calibration": fingerprint(self.calibration),
+            "weights": _digest(self.state_dict(), {})[:12] if self.trained else None,
             "scale": scale if self.trained else "solved",
         }
         origin |= {f"model_{key}": value for key, value in self.provenance.items()}
@@ -271,7 +272,9 @@ class Reconstructor(nn.Module):
             "calibration": fingerprint(self.calibration),
             "provenance": json.dumps(self.provenance),
         }
-        content = save({key: value.contiguous() for key, value in tensors.items()}, metadata)
+        tensors = {key: value.contiguous() for key, value in tensors.items()}
+        metadata["checksum"] = _digest(tensors, metadata)
+        content = save(tensors, metadata)
         with replacing(path) as temporary:
             temporary.write_bytes(content)
 
@@ -340,6 +343,16 @@ def fingerprint(calibration: Calibration) -> str:
     return digest.hexdigest()[:12]
 
 
+def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    """Return a checksum of named tensors and text."""
+    digest = hashlib.sha256(json.dumps(dict(metadata), sort_keys=True).encode())
+    for name in sorted(tensors):
+        value = tensors[name].detach().cpu().contiguous()
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
 def models() -> dict[str, str]:
     """Return the names of all reconstructors, each with one line about it."""
     return {name: description for name, (_, _, description) in MODELS.items()}
@@ -401,6 +414,9 @@ def _read(path: Path, calibration: Calibration) -> Reconstructor:
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path} is not a whole model file ({error}).") from error
+    stated = metadata.pop("checksum", None)
+    if stated is not None and stated != _digest(tensors, metadata):
+        raise InputError(f"{path} is damaged: it is not what its checksum says; copy it again.")
     foreign = InputError(f"{path} is not a model of squilla; make one with train.")
     name = metadata.get("name", "")
     if metadata.get("format") != "squilla model 1" or name not in MODELS:
