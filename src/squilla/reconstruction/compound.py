@@ -20,6 +20,11 @@ from torch.nn import functional
 
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
+from squilla.errors import InputError
+from squilla.reconstruction import compiled
+from squilla.reconstruction.coded import Coded, refine
+from squilla.reconstruction.compiled import CompiledCamera
+from squilla.reconstruction.engine import Network, compile_network
 from squilla.reconstruction.evidence import (
     CORRECTED,
     LEVELS,
@@ -213,6 +218,22 @@ class Compound(Reconstructor):
         self.register_buffer("basis", self.prior.basis.T.float(), persistent=False)
         self.register_buffer("hats", hats, persistent=False)
         self._cameras: dict[tuple[bool, ...], tuple[Camera, Camera]] = {}
+        self._compiled: dict[Camera, CompiledCamera] = {}
+        self._networks = self._made("torch")
+
+    def _made(self, engine: str) -> list[Network]:
+        return [
+            compile_network(Told(network), engine)
+            for network in (self.back.spectral, *self.back.finer)
+        ]
+
+    def _take(self, engine: str) -> None:
+        if engine.startswith("cuda"):
+            raise InputError(
+                "`compound` runs on a GPU as it is: call model.to('cuda'). Engines are for the "
+                "other networks there."
+            )
+        self._networks = self._made(engine)
 
     @classmethod
     def for_weights(cls, calibration: Calibration, weights: Mapping[str, Tensor]) -> "Compound":
@@ -312,7 +333,7 @@ class Compound(Reconstructor):
         return least + (most - least) * (torch.arange(ZONES) + 0.5) / ZONES
 
     def _apply(self, fn, recurse=True):
-        self._cameras = {}  # made anew on the device to which the module moves
+        self._cameras, self._compiled = {}, {}  # made anew on the device to which the module moves
         return super()._apply(fn, recurse)
 
     def _spectra(
@@ -356,9 +377,30 @@ class Compound(Reconstructor):
         lit = (y > 0).any(-1) & finite
         y = torch.where(finite[..., None], y, 0)
         ratio = torch.where(lit, ratio, torch.inf)
+        known = torch.where(finite, lit.float(), torch.nan)
+        levels = min(LEVELS, math.ceil(math.log2(max(height, width))))
+        if levels == LEVELS and not torch.is_grad_enabled() and y.device.type == "cpu":
+            seen = self._evidence(y[0], ratio[0], camera, None if zone is None else zone[0])
+            if not interval:
+                coded = self._coded(seen, known[0])
+                cube = coded.spell_out(self.basis.numpy(), torch.get_num_threads())
+                return torch.from_numpy(cube)[None], None
+        else:
+            seen = self._torch_evidence(y, ratio, camera, zone, levels)
+        coefficients, amplitude, spread = self.back(seen, interval)
+        amplitude = (amplitude[:, :height, :width] * known)[..., None]
+        x = ((coefficients[:, :height, :width] * amplitude) @ self.basis).relu_()
+        if spread is not None:
+            spread = (spread[:, :height, :width] * amplitude) @ self.hats
+        return x, spread
+
+    def _torch_evidence(
+        self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None, levels: int
+    ) -> Evidence:
+        """Return what the front end says of pictures, on any device."""
+        height, width = y.shape[1:3]
         if min(height, width) >= SMALLEST:
             ratio = ratio * noise_factor(y, ratio, camera)
-        levels = min(LEVELS, math.ceil(math.log2(max(height, width))))
         step = 2**levels
         below, right = -height % step, -width % step
         if below or right:
@@ -366,13 +408,35 @@ class Compound(Reconstructor):
             ratio = functional.pad(ratio, (0, right, 0, below), value=torch.inf)
             if zone is not None:
                 zone = functional.pad(zone, (0, right, 0, below))
-        seen = gather_evidence(y, ratio, camera, levels, zone)
-        coefficients, amplitude, spread = self.back(seen, interval)
-        amplitude = torch.where(finite, amplitude[:, :height, :width] * lit, torch.nan)[..., None]
-        x = ((coefficients[:, :height, :width] * amplitude) @ self.basis).relu_()
-        if spread is not None:
-            spread = (spread[:, :height, :width] * amplitude) @ self.hats
-        return x, spread
+        return gather_evidence(y, ratio, camera, levels, zone)
+
+    def _evidence(self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None) -> Evidence:
+        """Return what the front end says of one picture, compiled for a processor."""
+        if camera not in self._compiled:
+            self._compiled[camera] = CompiledCamera(camera)
+        matrices, threads = self._compiled[camera], torch.get_num_threads()
+        values, stated = y.contiguous().numpy(), ratio.contiguous().numpy()
+        factor = np.float32(1)
+        if min(stated.shape) >= SMALLEST:
+            factor = compiled.noise_factor(values, stated, matrices, threads)
+        places = None if zone is None else zone.numpy()
+        return compiled.gather_evidence(values, stated, factor, matrices, places, threads)
+
+    def _coded(self, seen: Evidence, known: Tensor) -> Coded:
+        coded = refine(seen, self._networks, self.back.scale.numpy(), torch.get_num_threads())
+        height, width = known.shape
+        return replace(coded, bright=coded.bright[:height, :width] * known.numpy())
+
+
+class Told(nn.Module):
+    """A `Refiner` without its features."""
+
+    def __init__(self, network: Refiner):
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.network(x)[0]
 
 
 def _hats(bands: int) -> Tensor:
