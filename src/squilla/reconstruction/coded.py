@@ -159,6 +159,17 @@ class Coded:
         )  # fmt: skip
         return cube
 
+    def at(self, rows: list[int], columns: list[int], basis: np.ndarray) -> np.ndarray:
+        """Return the spectra of some pixels, (N, K)."""
+        row, column = np.asarray(rows), np.asarray(columns)
+        whole = np.zeros((len(row), len(basis)), np.float32)
+        for number in range(4):
+            y = np.clip((row - 1) // 2 + number // 2, 0, len(self.coarse) - 1)
+            x = np.clip((column - 1) // 2 + number % 2, 0, self.coarse.shape[1] - 1)
+            whole += self.kin[row, column, number, None] * self.coarse[y, x]
+        whole[:, : self.changes.shape[-1]] += self.changes[row, column]
+        return np.maximum(whole @ basis, 0) * self.bright[row, column, None]
+
 
 def refine(seen: Evidence, networks: Sequence[Network], scale: np.ndarray, threads: int) -> Coded:
     """Do what `compound.BackEnd` does, up to the coefficients, for one picture.

@@ -8,7 +8,7 @@ A view is one array, (H, W, 2 + D): noise variance, amplitude, and the shape in 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
@@ -352,17 +352,17 @@ class CompiledCamera:
         )
 
 
-def noise_factor(y: np.ndarray, ratio: np.ndarray, camera: CompiledCamera, threads: int):
+def noise_factor(y: np.ndarray, ratio: np.ndarray, camera: CompiledCamera, threads: int) -> float:
     """Return by how much a picture is noisier than it says, as `evidence.noise_factor` does."""
     rows = (len(y) + 1) // 2
     expected, steps = np.empty((2, rows, y.shape[1] - 1), np.float32)
     over_rows(_quiet_steps, rows, threads, y, ratio, camera.flat, camera.quiet, expected, steps)
     steps = steps[(expected < 1e6) & ~np.isnan(steps)]
     if not steps.size:
-        return np.float32(1)
+        return 1.0
     middle = (steps.size - 1) // 2
     factor = np.partition(steps, middle)[middle] / (1 - 2 / (9 * camera.quiet.shape[1])) ** 3
-    return np.float32(np.clip(factor, 0.05, 20.0))
+    return float(np.clip(factor, 0.05, 20.0))
 
 
 def gather_evidence(
@@ -437,17 +437,23 @@ def gather_evidence(
         run(_divided, len(view), score, view, place, camera.spread)
         own.append(_product(score, camera.gain[..., : CORRECTED[level]], place))
 
-    def pictures(*values: np.ndarray) -> list[Tensor]:
+    def pictures(values: Iterable[np.ndarray]) -> list[Tensor]:
         return [torch.from_numpy(value)[None] for value in values]
 
-    levels = range(SPECTRAL)
+    finer = range(SPECTRAL)
+    mean, spread, features, bright, smooth = pictures(
+        (coefficients, variance, features, views[0][..., 1], best[..., 1])
+    )
     return Evidence(
-        *pictures(coefficients, variance, features),
-        pictures(*(kin[level] for level in levels)),
-        pictures(*(alone[level] for level in levels)),
-        pictures(*own),
-        pictures(*(known[level][..., 0] + _MODEL for level in levels)),
-        *pictures(views[0][..., 1], best[..., 1]),
+        coefficients=mean,
+        variance=spread,
+        features=features,
+        kin=pictures(kin[level] for level in finer),
+        alone=pictures(alone[level] for level in finer),
+        own=pictures(own),
+        noise=pictures(known[level][..., 0] + _MODEL for level in finer),
+        amplitude=bright,
+        smooth=smooth,
     )
 
 

@@ -11,6 +11,7 @@ Pictures are (B, H, W, channels); level l has cells of 2^l px.
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +25,7 @@ from squilla.errors import InputError
 from squilla.reconstruction import compiled
 from squilla.reconstruction.coded import Coded, refine
 from squilla.reconstruction.compiled import CompiledCamera
-from squilla.reconstruction.engine import Network, compile_network
+from squilla.reconstruction.engine import Network, compile_network, write_onnx
 from squilla.reconstruction.evidence import (
     CORRECTED,
     LEVELS,
@@ -34,6 +35,7 @@ from squilla.reconstruction.evidence import (
     inherit,
     noise_factor,
 )
+from squilla.reconstruction.partial import CodedReconstruction, Reconstruction
 from squilla.reconstruction.prior import Prior, broad_prior
 from squilla.reconstruction.reconstructor import Reconstructor, Scale, check_scale, picture
 
@@ -112,6 +114,11 @@ class BackEnd(nn.Module):
             [Refiner(2 * fine + 4, 24, 1, fine + 2), Refiner(2 * middle + 4, 48, 1, middle + 2)]
         )
         self.margin = nn.Sequential(nn.Linear(24, 32), nn.ReLU(), nn.Linear(32, KNOTS))
+
+    def networks(self) -> list[Refiner]:
+        """Return those of the coarse cells, of the finest and of those between."""
+        networks = [self.spectral, *self.finer]
+        return [network for network in networks if isinstance(network, Refiner)]
 
     def forward(
         self, seen: Evidence, interval: bool = False
@@ -222,10 +229,7 @@ class Compound(Reconstructor):
         self._networks = self._made("torch")
 
     def _made(self, engine: str) -> list[Network]:
-        return [
-            compile_network(Told(network), engine)
-            for network in (self.back.spectral, *self.back.finer)
-        ]
+        return [compile_network(Told(network), engine) for network in self.back.networks()]
 
     def _take(self, engine: str) -> None:
         if engine.startswith("cuda"):
@@ -281,7 +285,7 @@ class Compound(Reconstructor):
         check_scale(scale)
         with torch.inference_mode():
             cube, _ = self._spectra(*self._usable(measurement))
-        return self._labelled(cube.cpu().numpy(), measurement, scale)
+        return self.labelled(cube.cpu().numpy(), measurement, scale)
 
     def reconstruct_interval(self, measurement: Measurement) -> "tuple[DataArray, DataArray]":
         """Return the cube of `reconstruct` and half the width of its 90 % interval."""
@@ -289,11 +293,31 @@ class Compound(Reconstructor):
             cube, width = self._spectra(*self._usable(measurement), interval=True)
         assert width is not None
         both = [
-            self._labelled(values.cpu().numpy(), measurement, "consistent")
+            self.labelled(values.cpu().numpy(), measurement, "consistent")
             for values in (cube, width)
         ]
         both[1].attrs["long_name"] = "half width of the 90 % interval of the photon radiance"
         return both[0], both[1].rename("interval")
+
+    def look(self, measurement: Measurement) -> Reconstruction:
+        y, angle, snr, channels = self._usable(measurement)
+        if y.device.type != "cpu" or max(y.shape[:2]) <= 2 ** (LEVELS - 1):
+            return super().look(measurement)
+        camera, ratio, zone = self._told(y, angle, snr, channels)
+        with torch.inference_mode():
+            picture, ratio, known = _lit(y, ratio)
+            coded = self._coded(self._evidence(picture, ratio, camera, zone), known)
+        return CodedReconstruction(self, measurement, coded, self.basis.numpy())
+
+    def export(self, path: str | Path) -> None:
+        """Write the networks of the back end as ONNX files, one for each size of cells.
+
+        `path` gets -4, -2 and -1, the side of the cells in px, before its suffix.
+        """
+        path = Path(path)
+        for network, side in zip(self.back.networks(), (4, 1, 2), strict=True):
+            shape = (1, 16, 16, network.enter.in_features)
+            write_onnx(Told(network), shape, path.with_stem(f"{path.stem}-{side}"))
 
     def _usable(self, measurement: Measurement):
         """Return y, angle, snr and channels of a measurement.
@@ -349,15 +373,10 @@ class Compound(Reconstructor):
         pixels, bands = y.shape[:-1], len(self.wavelength)
         if y.numel() == 0:
             return y.new_zeros(*pixels, bands), y.new_zeros(*pixels, bands) if interval else None
-        camera = self._camera(channels, angle is not None)
+        camera, ratio, zone = self._told(y, angle, snr, channels)
         y = y.reshape(-1, height, width, y.shape[-1])
-        ratio = 10 ** (-(y.new_tensor(UNKNOWN) if snr is None else snr).clamp_max(60) / 10)
-        ratio = ratio.expand(pixels).reshape(y.shape[:-1])
-        zone = None
-        if angle is not None:
-            middles = self._middles().to(y.device)
-            edges = (middles[1:] + middles[:-1]) / 2
-            zone = torch.bucketize(angle.reshape(y.shape[:-1]).square(), edges)
+        ratio = ratio.reshape(y.shape[:-1])
+        zone = None if zone is None else zone.reshape(y.shape[:-1])
         size = self.piece if height * width == 1 else 1
         parts = [
             self._pictures(
@@ -369,15 +388,26 @@ class Compound(Reconstructor):
         spreads = [part[1] for part in parts if part[1] is not None]
         return x, torch.cat(spreads).view(*pixels, bands) if interval else None
 
+    def _told(
+        self,
+        y: Tensor,
+        angle: Tensor | None,
+        snr: Tensor | None,
+        channels: tuple[bool, ...] | None,
+    ) -> tuple[Camera, Tensor, Tensor | None]:
+        """Return the camera, and of each pixel the noise over the signal and its zone."""
+        ratio = 10 ** (-(y.new_tensor(UNKNOWN) if snr is None else snr).clamp_max(60) / 10)
+        zone = None
+        if angle is not None:
+            middles = self._middles().to(y.device)
+            zone = torch.bucketize(angle.square(), (middles[1:] + middles[:-1]) / 2)
+        return self._camera(channels, angle is not None), ratio.expand(y.shape[:-1]), zone
+
     def _pictures(
         self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None, interval: bool
     ) -> tuple[Tensor, Tensor | None]:
         height, width = y.shape[1:3]
-        finite = y.isfinite().all(-1)
-        lit = (y > 0).any(-1) & finite
-        y = torch.where(finite[..., None], y, 0)
-        ratio = torch.where(lit, ratio, torch.inf)
-        known = torch.where(finite, lit.float(), torch.nan)
+        y, ratio, known = _lit(y, ratio)
         levels = min(LEVELS, math.ceil(math.log2(max(height, width))))
         if levels == LEVELS and not torch.is_grad_enabled() and y.device.type == "cpu":
             seen = self._evidence(y[0], ratio[0], camera, None if zone is None else zone[0])
@@ -416,7 +446,7 @@ class Compound(Reconstructor):
             self._compiled[camera] = CompiledCamera(camera)
         matrices, threads = self._compiled[camera], torch.get_num_threads()
         values, stated = y.contiguous().numpy(), ratio.contiguous().numpy()
-        factor = np.float32(1)
+        factor = 1.0
         if min(stated.shape) >= SMALLEST:
             factor = compiled.noise_factor(values, stated, matrices, threads)
         places = None if zone is None else zone.numpy()
@@ -426,6 +456,17 @@ class Compound(Reconstructor):
         coded = refine(seen, self._networks, self.back.scale.numpy(), torch.get_num_threads())
         height, width = known.shape
         return replace(coded, bright=coded.bright[:height, :width] * known.numpy())
+
+
+def _lit(y: Tensor, ratio: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return y without NaN, infinite noise where nothing was measured, and what brightness becomes.
+
+    The last is 1 where there was light, 0 where there was none, and NaN where y is not finite.
+    """
+    finite = y.isfinite().all(-1)
+    lit = (y > 0).any(-1) & finite
+    known = torch.where(finite, lit.float(), torch.nan)
+    return torch.where(finite[..., None], y, 0), torch.where(lit, ratio, torch.inf), known
 
 
 class Told(nn.Module):

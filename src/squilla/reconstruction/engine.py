@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +164,7 @@ class Recorded:
 
 
 def onnx_program(network: nn.Module, shape: tuple[int, ...]) -> bytes:
-    """Return a network in the ONNX format, for inputs of one shape but for the first axis.
+    """Return a network in the ONNX format, free in all axes of its input but the last.
 
     Raises
     ------
@@ -173,19 +172,18 @@ def onnx_program(network: nn.Module, shape: tuple[int, ...]) -> bytes:
         If the packages for it are not installed.
     """
     _demand("Export to ONNX", "onnx", "onnxscript")
-    pixels = torch.export.Dim("pixels", min=1)
-    stream = BytesIO()
-    # One row would be taken for a constant.
-    example = torch.zeros(max(shape[0], 2), *shape[1:])
+    axes = dict(enumerate(("pixels",) if len(shape) == 2 else ("pictures", "rows", "columns")))
+    free = {axis: torch.export.Dim(name, min=1, max=2**20) for axis, name in axes.items()}
+    # Axes of length one would be taken for constants.
+    sides = [max(length, 2 + axis) for axis, length in enumerate(shape[:-1])]
+    example = torch.zeros(*sides, shape[-1])
     with _quietly(), torch.inference_mode():
         program = torch.onnx.export(
             network.eval(), (example,), dynamo=True, external_data=False, verbose=False,
-            input_names=["measurement"], output_names=["spectrum"],
-            dynamic_shapes=({0: pixels},),
+            input_names=["measurement"], output_names=["spectrum"], dynamic_shapes=(free,),
         )  # fmt: skip
-        assert program is not None
-        program.save(stream)
-    return stream.getvalue()
+    assert program is not None
+    return program.model_proto.SerializeToString()
 
 
 def write_onnx(network: nn.Module, shape: tuple[int, ...], path: str | Path) -> None:
