@@ -159,6 +159,26 @@ def test_the_compound_models_networks_are_exported_for_any_picture(tmp_path):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
 
 
+@needs("onnxruntime", "onnx", "onnxscript")
+def test_export_by_command(tmp_path):
+    import onnxruntime
+    from typer.testing import CliRunner
+
+    from squilla.calibration.store import save_calibration
+    from squilla.cli.app import app
+
+    save_calibration(CAMERA, tmp_path / "camera.nc")
+    model_class("mlp")(CAMERA).save(tmp_path / "mlp.safetensors")
+    words = [
+        "export-model", "--calibration", tmp_path / "camera.nc",
+        "--model", tmp_path / "mlp.safetensors", "-o", tmp_path / "mlp.onnx",
+    ]  # fmt: skip
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    shape = onnxruntime.InferenceSession(tmp_path / "mlp.onnx").get_inputs()[0].shape
+    assert shape[1] == 20
+
+
 def test_what_is_missing_is_told(monkeypatch):
     with pytest.raises(InputError, match="There is no engine 'tvm'"):
         load_model("compound", CAMERA, engine="tvm")

@@ -94,6 +94,17 @@ def sigmoid(x):
 
 
 @compiled
+def _light(first, last, y, known):
+    for row in range(first, last):
+        for column in range(y.shape[1]):
+            pixel, most, total = y[row, column], np.float32(0), np.float32(0)
+            for i in range(pixel.size):
+                most = max(most, pixel[i])
+                total += pixel[i] * 0  # NaN if anything is not finite
+            known[row, column] = total + (ONE if most > 0 else np.float32(0))
+
+
+@compiled
 def _quiet_steps(first, last, y, ratio, flat, quiet, expected, steps):
     """Write by how much neighbours differ, of what is expected; every other row."""
     width, channels = y.shape[1:]
@@ -350,6 +361,13 @@ class CompiledCamera:
             within.reshape(len(zones), -1, clusters, within.shape[-1]),
             LEADING,
         )
+
+
+def light(y: np.ndarray, threads: int) -> np.ndarray:
+    """Return 1 where something was measured, 0 where all was dark, NaN where y is not finite."""
+    known = np.empty(y.shape[:2], np.float32)
+    over_rows(_light, len(y), threads, y, known)
+    return known
 
 
 def noise_factor(y: np.ndarray, ratio: np.ndarray, camera: CompiledCamera, threads: int) -> float:

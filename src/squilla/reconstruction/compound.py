@@ -305,8 +305,7 @@ class Compound(Reconstructor):
             return super().look(measurement)
         camera, ratio, zone = self._told(y, angle, snr, channels)
         with torch.inference_mode():
-            picture, ratio, known = _lit(y, ratio)
-            coded = self._coded(self._evidence(picture, ratio, camera, zone), known)
+            coded = self._coded(*self._evidence(y, ratio, camera, zone))
         return CodedReconstruction(self, measurement, coded, self.basis.numpy())
 
     def export(self, path: str | Path) -> None:
@@ -329,7 +328,10 @@ class Compound(Reconstructor):
 
         y = torch.as_tensor(measurement.y, dtype=torch.float32)
         y, angle, snr = self._accepted(picture(y), measurement.angle, measurement.snr)
-        valid = torch.as_tensor(measurement.valid, dtype=torch.bool) & y.isfinite()
+        valid = torch.as_tensor(measurement.valid, dtype=torch.bool)
+        if valid.all() and y.sum().isfinite():  # nothing is missing, as nearly always
+            return y.to(self.basis.device), angle, snr, (True,) * y.shape[-1]
+        valid = valid & y.isfinite()
         enough = valid.sum(-1) >= (y.shape[-1] + 1) // 2
         channels = valid[enough].float().mean(0) >= 0.5
         part = replace(self.calibration, sensitivity=self.calibration.sensitivity[:, channels])
@@ -384,9 +386,9 @@ class Compound(Reconstructor):
             )
             for some in torch.arange(len(y), device=y.device).split(size)
         ]
-        x = torch.cat([part[0] for part in parts]).view(*pixels, bands)
+        x = _joined([part[0] for part in parts]).view(*pixels, bands)
         spreads = [part[1] for part in parts if part[1] is not None]
-        return x, torch.cat(spreads).view(*pixels, bands) if interval else None
+        return x, _joined(spreads).view(*pixels, bands) if interval else None
 
     def _told(
         self,
@@ -407,15 +409,19 @@ class Compound(Reconstructor):
         self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None, interval: bool
     ) -> tuple[Tensor, Tensor | None]:
         height, width = y.shape[1:3]
-        y, ratio, known = _lit(y, ratio)
         levels = min(LEVELS, math.ceil(math.log2(max(height, width))))
         if levels == LEVELS and not torch.is_grad_enabled() and y.device.type == "cpu":
-            seen = self._evidence(y[0], ratio[0], camera, None if zone is None else zone[0])
+            seen, known = self._evidence(y[0], ratio[0], camera, None if zone is None else zone[0])
             if not interval:
-                coded = self._coded(seen, known[0])
+                coded = self._coded(seen, known)
                 cube = coded.spell_out(self.basis.numpy(), torch.get_num_threads())
                 return torch.from_numpy(cube)[None], None
+            known = torch.from_numpy(known)
         else:
+            finite = y.isfinite().all(-1)
+            lit = (y > 0).any(-1) & finite
+            known = torch.where(finite, lit.float(), torch.nan)
+            y, ratio = torch.where(finite[..., None], y, 0), torch.where(lit, ratio, torch.inf)
             seen = self._torch_evidence(y, ratio, camera, zone, levels)
         coefficients, amplitude, spread = self.back(seen, interval)
         amplitude = (amplitude[:, :height, :width] * known)[..., None]
@@ -440,33 +446,38 @@ class Compound(Reconstructor):
                 zone = functional.pad(zone, (0, right, 0, below))
         return gather_evidence(y, ratio, camera, levels, zone)
 
-    def _evidence(self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None) -> Evidence:
-        """Return what the front end says of one picture, compiled for a processor."""
+    def _evidence(
+        self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None
+    ) -> tuple[Evidence, np.ndarray]:
+        """Return what the front end says of one picture, by loops compiled for a processor.
+
+        And what brightness is multiplied by: 1 where there was light, 0 where there was none, NaN
+        where y is not finite.
+        """
         if camera not in self._compiled:
             self._compiled[camera] = CompiledCamera(camera)
         matrices, threads = self._compiled[camera], torch.get_num_threads()
         values, stated = y.contiguous().numpy(), ratio.contiguous().numpy()
+        known = compiled.light(values, threads)
+        if not known.min() > 0:
+            values = np.where(np.isnan(known)[..., None], np.float32(0), values)
+            stated = np.where(known > 0, stated, np.float32(np.inf))
         factor = 1.0
         if min(stated.shape) >= SMALLEST:
             factor = compiled.noise_factor(values, stated, matrices, threads)
         places = None if zone is None else zone.numpy()
-        return compiled.gather_evidence(values, stated, factor, matrices, places, threads)
+        seen = compiled.gather_evidence(values, stated, factor, matrices, places, threads)
+        return seen, known
 
-    def _coded(self, seen: Evidence, known: Tensor) -> Coded:
+    def _coded(self, seen: Evidence, known: np.ndarray) -> Coded:
         coded = refine(seen, self._networks, self.back.scale.numpy(), torch.get_num_threads())
         height, width = known.shape
-        return replace(coded, bright=coded.bright[:height, :width] * known.numpy())
+        return replace(coded, bright=coded.bright[:height, :width] * known)
 
 
-def _lit(y: Tensor, ratio: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return y without NaN, infinite noise where nothing was measured, and what brightness becomes.
-
-    The last is 1 where there was light, 0 where there was none, and NaN where y is not finite.
-    """
-    finite = y.isfinite().all(-1)
-    lit = (y > 0).any(-1) & finite
-    known = torch.where(finite, lit.float(), torch.nan)
-    return torch.where(finite[..., None], y, 0), torch.where(lit, ratio, torch.inf), known
+def _joined(parts: list[Tensor]) -> Tensor:
+    """Put parts one after another; one alone is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
 class Told(nn.Module):
