@@ -215,17 +215,15 @@ def _kinship(first, last, view, known, coarse, power, kin, alone):
             against = _telling(own[0] + mean + 2 * _MODEL, power, scale)
             most = np.float32(-np.inf)
             for number in range(4):
-                other = around[number]
-                log = against - _difference(own, other, scale) - math.log(other[0] + _MODEL)
-                shares[number] = log
-                most = max(most, log)
+                shares[number] = against - _difference(own, around[number], scale)
+                most = max(most, shares[number])
             total = np.float32(0)
             for number in range(4):
-                shares[number] = math.exp(shares[number] - most)
+                shares[number] = math.exp(shares[number] - most) / (around[number][0] + _MODEL)
                 total += shares[number]
             for number in range(4):
                 shares[number] /= total
-            alone[row, column] = -math.log(known[row, column, 0] + _MODEL) - most - math.log(total)
+            alone[row, column] = -math.log((known[row, column, 0] + _MODEL) * total) - most
 
 
 @compiled
@@ -497,14 +495,14 @@ def _product(picture: np.ndarray, matrices: np.ndarray, zone: np.ndarray) -> np.
 
 def over_rows(kernel: Callable[..., None], rows: int, threads: int, *arguments) -> None:
     """Call a kernel for all rows, shared by threads."""
-    if threads == 1:
+    # Twice as many parts as threads, since the machine may have other work; but no small ones.
+    parts = min(rows // 32, 2 * threads)
+    if threads == 1 or parts < 2:
         kernel(0, rows, *arguments)
         return
-    # Several parts for each thread, since the machine may have other work.
-    parts = np.linspace(0, rows, min(rows, 4 * threads) + 1).astype(int)
+    edges = [rows * number // parts for number in range(parts + 1)]
     futures = [
-        _pool(threads).submit(kernel, first, last, *arguments)
-        for first, last in pairwise(parts.tolist())
+        _pool(threads).submit(kernel, first, last, *arguments) for first, last in pairwise(edges)
     ]
     for future in futures:
         future.result()

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from threading import local
 from typing import Any
 
 import numpy as np
@@ -105,9 +106,12 @@ def _openvino(network: nn.Module, shape: tuple[int, ...], engine: str) -> Networ
     }
     compiled = openvino.Core().compile_model(model, "CPU", settings)
 
+    own = local()  # a request for each thread, so that threads do not meet in one
+
     def run(inputs: np.ndarray) -> np.ndarray:
-        # A request of its own for each call, so that threads do not meet in one.
-        return compiled.create_infer_request().infer([inputs], share_inputs=True)[0]
+        if not hasattr(own, "request"):
+            own.request = compiled.create_infer_request()
+        return own.request.infer([inputs], share_inputs=True)[0]
 
     return run
 

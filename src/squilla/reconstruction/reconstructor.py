@@ -187,7 +187,7 @@ class Reconstructor(nn.Module):
             self._take(engine)
             found = reference if engine == "torch" else self(y, snr=30.0)
         away = error(found.numpy(), reference.numpy())
-        self.provenance |= {"engine": engine, "engine_error": round(away, 7)}
+        self.provenance |= {"engine": engine, "engine_error": float(f"{away:.2g}")}
         return self
 
     def _take(self, engine: str) -> None:
