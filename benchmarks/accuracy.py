@@ -1,11 +1,13 @@
 """How far every reconstructor is from the truth, in one table.
 
-    python benchmarks/accuracy.py [--weights FILE] [--quick]
+    python benchmarks/accuracy.py [--weights FILE] [--networks FOLDER] [--quick]
 
 Every row is a scene before a simulated camera, y = R x + noise; no row has a spectrum, a scene or a
 random array that any method was trained on. The networks that know one camera stand only in that
-camera's rows: `mlp` was trained on the broad prior. Methods that treat every pixel alone are judged
-on 3000 pixels of each scene, the others on all. Writes experiments/results/accuracy.json.
+camera's rows: `mlp` was trained on the broad prior; --networks adds every model file of a folder,
+such as those of the thesis' recipe that experiments/table_5_1.py leaves in experiments/work.
+Methods that treat every pixel alone are judged on 3000 pixels of each scene, the others on all.
+Writes experiments/results/accuracy.json.
 """
 
 import argparse
@@ -170,22 +172,24 @@ def cases(quick: bool) -> list[Case]:
 # --- judgement ----------------------------------------------------------------------------------
 
 
-def judge(case: Case, weights: Path | None) -> dict:
+def judge(case: Case, weights: Path | None, networks: list[Path]) -> dict:
     """Return the metrics of every method for one row."""
     generator = Generator().manual_seed(1)
     truth = case.truth.reshape(-1, len(WAVELENGTH))
     bright = torch.nonzero(truth.amax(-1) >= DARKEST * truth.max())[:, 0]
     some = bright[torch.randperm(len(bright), generator=generator)[:SAMPLE]]
     result: dict = {"row": case.name}
-    names = ["ridge", "sparse"]
+    names: list[str | Path] = ["ridge", "sparse"]
     if case.calibration.filters == 36 and len(case.calibration.angle) == 1 and not case.dead:
-        names.append("mlp")
+        names += ["mlp", *networks]
     for name in names:
         try:
             model = load_model(name, case.calibration)
         except squilla.InputError:  # the network of another camera
             continue
-        result[name] = _metrics(pixel_wise(model, case, some), truth[some])
+        result[name if isinstance(name, str) else name.stem] = _metrics(
+            pixel_wise(model, case, some), truth[some]
+        )
     model = load_model("compound" if weights is None else weights, case.calibration)
     assert isinstance(model, Compound)
     began = time.perf_counter()
@@ -296,18 +300,20 @@ def mtf50(picture: np.ndarray, distance: np.ndarray) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description="The table of accuracy.")
     parser.add_argument("--weights", type=Path, help="compound weights; default: those that ship")
+    parser.add_argument("--networks", type=Path, help="folder of models of the trained camera")
     parser.add_argument("--quick", action="store_true", help="two unseen arrays instead of ten")
     parser.add_argument("--only", help="rows whose name holds this text")
     options = parser.parse_args()
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1)))
-    names = ("ridge", "sparse", "mlp", "compound")
+    networks = sorted(options.networks.glob("*.safetensors")) if options.networks else []
+    names = ("ridge", "sparse", "mlp", *(path.stem for path in networks), "compound")
     print("| row | " + " | ".join(names) + " | SAM | PSNR | cover |")
-    print("|---" * 8 + "|")
+    print("|---" * (len(names) + 4) + "|")
     rows = []
     for case in cases(options.quick):
         if options.only and options.only not in case.name:
             continue
-        row = judge(case, options.weights)
+        row = judge(case, options.weights, networks)
         rows.append(row)
         errors = [f"{row[name]['mse']:.5f}" if name in row else "" for name in names]
         own = row["compound"]

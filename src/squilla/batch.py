@@ -40,12 +40,14 @@ class Recipe:
     model : name or file of a model.
     distance : of the scenes, mm; None if it is found from each of them.
     depth : whether to find a distance for every point instead.
+    engine : what runs the networks, see `reconstruction.engine`; None for PyTorch.
     """
 
     calibration: Path
     model: str = "ridge"
     distance: float | None = None
     depth: bool = False
+    engine: str | None = None
 
     def state(self) -> dict[str, Any]:
         """Return all that decides what comes out, to tell whether a run may go on."""
@@ -223,7 +225,7 @@ def _loaded(recipe: Recipe, state: str) -> "tuple[Calibration, Reconstructor]":
     from squilla.reconstruction.reconstructor import load_model
 
     calibration = load_calibration(recipe.calibration)
-    return calibration, load_model(recipe.model, calibration)
+    return calibration, load_model(recipe.model, calibration, recipe.engine)
 
 
 def _first_cube(frames: list[Frame], recipe: Recipe) -> "xr.Dataset | None":

@@ -7,6 +7,7 @@ import typer
 from squilla import __version__
 from squilla.cli import camera, cameras, filters, steps
 from squilla.cli.align import align
+from squilla.cli.export import export_model
 from squilla.cli.train import train
 from squilla.cli.view import live, view
 
@@ -34,6 +35,7 @@ app.command()(cameras.cameras)
 app.command()(cameras.grab)
 app.command(name="twin-camera")(cameras.twin_camera)
 app.command()(camera.models)
+app.command(name="export-model")(export_model)
 
 
 @app.callback(invoke_without_command=True)

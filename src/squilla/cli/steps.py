@@ -227,6 +227,10 @@ def reconstruct(
     depth: Annotated[
         bool, typer.Option("--depth", help="Find the distance of every point; save it too.")
     ] = False,
+    engine: Annotated[
+        str | None,
+        typer.Option(help="Runs the networks: torch, openvino, openvino-bf16, onnxruntime, cuda."),
+    ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes for many frames; default: every core.")
     ] = None,
@@ -251,7 +255,7 @@ def reconstruct(
     check_distance(distance)
 
     frames = [frame for path in raw for frame in list_frames(path)]
-    recipe = Recipe(calibration, model, distance, depth)
+    recipe = Recipe(calibration, model, distance, depth, engine)
     into = output.is_dir() and output.suffix != ".zarr"
     if len(frames) > 1 or into:
         if not into and output.suffix != ".zarr":
@@ -272,6 +276,9 @@ def reconstruct(
         f"{output}: {told['snr']:.1f} dB, {relief if depth else plane}"
         f"{told['alignment_score']:.2f})"
     )
+    if engine is not None:
+        away = cube.attrs["model_engine_error"]
+        typer.echo(f"  {engine}: {away:.1e} from PyTorch in float32 (rms over rms)")
 
 
 def _reconstruct_many(

@@ -10,6 +10,7 @@ Pictures are (B, H, W, channels); level l has cells of 2^l px.
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,11 @@ from torch.nn import functional
 
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
+from squilla.errors import InputError
+from squilla.reconstruction import compiled
+from squilla.reconstruction.coded import Coded, refine
+from squilla.reconstruction.compiled import CompiledCamera
+from squilla.reconstruction.engine import Network, compile_network, write_onnx
 from squilla.reconstruction.evidence import (
     CORRECTED,
     LEVELS,
@@ -28,6 +34,7 @@ from squilla.reconstruction.evidence import (
     inherit,
     noise_factor,
 )
+from squilla.reconstruction.partial import CodedReconstruction, Reconstruction
 from squilla.reconstruction.prior import Prior, broad_prior
 from squilla.reconstruction.reconstructor import Reconstructor, Scale, check_scale, picture
 
@@ -106,6 +113,11 @@ class BackEnd(nn.Module):
             [Refiner(2 * fine + 4, 24, 1, fine + 2), Refiner(2 * middle + 4, 48, 1, middle + 2)]
         )
         self.margin = nn.Sequential(nn.Linear(24, 32), nn.ReLU(), nn.Linear(32, KNOTS))
+
+    def networks(self) -> list[Refiner]:
+        """Return those of the coarse cells, of the finest and of those between."""
+        networks = [self.spectral, *self.finer]
+        return [network for network in networks if isinstance(network, Refiner)]
 
     def forward(
         self, seen: Evidence, interval: bool = False
@@ -212,6 +224,19 @@ class Compound(Reconstructor):
         self.register_buffer("basis", self.prior.basis.T.float(), persistent=False)
         self.register_buffer("hats", hats, persistent=False)
         self._cameras: dict[tuple[bool, ...], tuple[Camera, Camera]] = {}
+        self._compiled: dict[Camera, CompiledCamera] = {}
+        self._networks = self._made("torch")
+
+    def _made(self, engine: str) -> list[Network]:
+        return [compile_network(Told(network), engine) for network in self.back.networks()]
+
+    def _take(self, engine: str) -> None:
+        if engine.startswith("cuda"):
+            raise InputError(
+                "`compound` runs on a GPU as it is: call model.to('cuda'). Engines are for the "
+                "other networks there."
+            )
+        self._networks = self._made(engine)
 
     @classmethod
     def for_weights(cls, calibration: Calibration, weights: Mapping[str, Tensor]) -> "Compound":
@@ -259,7 +284,7 @@ class Compound(Reconstructor):
         check_scale(scale)
         with torch.inference_mode():
             cube, _ = self._spectra(*self._usable(measurement))
-        return self._labelled(cube.cpu().numpy(), measurement, scale)
+        return self.labelled(cube.cpu().numpy(), measurement, scale)
 
     def reconstruct_interval(self, measurement: Measurement) -> "tuple[DataArray, DataArray]":
         """Return the cube of `reconstruct` and half the width of its 90 % interval."""
@@ -267,11 +292,30 @@ class Compound(Reconstructor):
             cube, width = self._spectra(*self._usable(measurement), interval=True)
         assert width is not None
         both = [
-            self._labelled(values.cpu().numpy(), measurement, "consistent")
+            self.labelled(values.cpu().numpy(), measurement, "consistent")
             for values in (cube, width)
         ]
         both[1].attrs["long_name"] = "half width of the 90 % interval of the photon radiance"
         return both[0], both[1].rename("interval")
+
+    def look(self, measurement: Measurement) -> Reconstruction:
+        y, angle, snr, channels = self._usable(measurement)
+        if y.device.type != "cpu" or max(y.shape[:2]) <= 2 ** (LEVELS - 1):
+            return super().look(measurement)
+        camera, ratio, zone = self._told(y, angle, snr, channels)
+        with torch.inference_mode():
+            coded = self._coded(*self._evidence(y, ratio, camera, zone))
+        return CodedReconstruction(self, measurement, coded, self.basis.numpy())
+
+    def export(self, path: str | Path) -> None:
+        """Write the networks of the back end as ONNX files, one for each size of cells.
+
+        `path` gets -4, -2 and -1, the side of the cells in px, before its suffix.
+        """
+        path = Path(path)
+        for network, side in zip(self.back.networks(), (4, 1, 2), strict=True):
+            shape = (1, 16, 16, network.enter.in_features)
+            write_onnx(Told(network), shape, path.with_stem(f"{path.stem}-{side}"))
 
     def _usable(self, measurement: Measurement):
         """Return y, angle, snr and channels of a measurement.
@@ -283,7 +327,10 @@ class Compound(Reconstructor):
 
         y = torch.as_tensor(measurement.y, dtype=torch.float32)
         y, angle, snr = self._accepted(picture(y), measurement.angle, measurement.snr)
-        valid = torch.as_tensor(measurement.valid, dtype=torch.bool) & y.isfinite()
+        valid = torch.as_tensor(measurement.valid, dtype=torch.bool)
+        if valid.all() and y.sum().isfinite():  # nothing is missing, as nearly always
+            return y.to(self.basis.device), angle, snr, (True,) * y.shape[-1]
+        valid = valid & y.isfinite()
         enough = valid.sum(-1) >= (y.shape[-1] + 1) // 2
         channels = valid[enough].float().mean(0) >= 0.5
         known = self.calibration
@@ -312,7 +359,7 @@ class Compound(Reconstructor):
         return least + (most - least) * (torch.arange(ZONES) + 0.5) / ZONES
 
     def _apply(self, fn, recurse=True):
-        self._cameras = {}  # made anew on the device to which the module moves
+        self._cameras, self._compiled = {}, {}  # made anew on the device to which the module moves
         return super()._apply(fn, recurse)
 
     def _spectra(
@@ -328,15 +375,10 @@ class Compound(Reconstructor):
         pixels, bands = y.shape[:-1], len(self.wavelength)
         if y.numel() == 0:
             return y.new_zeros(*pixels, bands), y.new_zeros(*pixels, bands) if interval else None
-        camera = self._camera(channels, angle is not None)
+        camera, ratio, zone = self._told(y, angle, snr, channels)
         y = y.reshape(-1, height, width, y.shape[-1])
-        ratio = 10 ** (-(y.new_tensor(UNKNOWN) if snr is None else snr).clamp_max(60) / 10)
-        ratio = ratio.expand(pixels).reshape(y.shape[:-1])
-        zone = None
-        if angle is not None:
-            middles = self._middles().to(y.device)
-            edges = (middles[1:] + middles[:-1]) / 2
-            zone = torch.bucketize(angle.reshape(y.shape[:-1]).square(), edges)
+        ratio = ratio.reshape(y.shape[:-1])
+        zone = None if zone is None else zone.reshape(y.shape[:-1])
         size = self.piece if height * width == 1 else 1
         parts = [
             self._pictures(
@@ -344,21 +386,57 @@ class Compound(Reconstructor):
             )
             for some in torch.arange(len(y), device=y.device).split(size)
         ]
-        x = torch.cat([part[0] for part in parts]).view(*pixels, bands)
+        x = _joined([part[0] for part in parts]).view(*pixels, bands)
         spreads = [part[1] for part in parts if part[1] is not None]
-        return x, torch.cat(spreads).view(*pixels, bands) if interval else None
+        return x, _joined(spreads).view(*pixels, bands) if interval else None
+
+    def _told(
+        self,
+        y: Tensor,
+        angle: Tensor | None,
+        snr: Tensor | None,
+        channels: tuple[bool, ...] | None,
+    ) -> tuple[Camera, Tensor, Tensor | None]:
+        """Return the camera, and of each pixel the noise over the signal and its zone."""
+        ratio = 10 ** (-(y.new_tensor(UNKNOWN) if snr is None else snr).clamp_max(60) / 10)
+        zone = None
+        if angle is not None:
+            middles = self._middles().to(y.device)
+            zone = torch.bucketize(angle.square(), (middles[1:] + middles[:-1]) / 2)
+        return self._camera(channels, angle is not None), ratio.expand(y.shape[:-1]), zone
 
     def _pictures(
         self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None, interval: bool
     ) -> tuple[Tensor, Tensor | None]:
         height, width = y.shape[1:3]
-        finite = y.isfinite().all(-1)
-        lit = (y > 0).any(-1) & finite
-        y = torch.where(finite[..., None], y, 0)
-        ratio = torch.where(lit, ratio, torch.inf)
+        levels = min(LEVELS, math.ceil(math.log2(max(height, width))))
+        if levels == LEVELS and not torch.is_grad_enabled() and y.device.type == "cpu":
+            seen, known = self._evidence(y[0], ratio[0], camera, None if zone is None else zone[0])
+            if not interval:
+                coded = self._coded(seen, known)
+                cube = coded.spell_out(self.basis.numpy(), torch.get_num_threads())
+                return torch.from_numpy(cube)[None], None
+            known = torch.from_numpy(known)
+        else:
+            finite = y.isfinite().all(-1)
+            lit = (y > 0).any(-1) & finite
+            known = torch.where(finite, lit.float(), torch.nan)
+            y, ratio = torch.where(finite[..., None], y, 0), torch.where(lit, ratio, torch.inf)
+            seen = self._torch_evidence(y, ratio, camera, zone, levels)
+        coefficients, amplitude, spread = self.back(seen, interval)
+        amplitude = (amplitude[:, :height, :width] * known)[..., None]
+        x = ((coefficients[:, :height, :width] * amplitude) @ self.basis).relu_()
+        if spread is not None:
+            spread = (spread[:, :height, :width] * amplitude) @ self.hats
+        return x, spread
+
+    def _torch_evidence(
+        self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None, levels: int
+    ) -> Evidence:
+        """Return what the front end says of pictures, on any device."""
+        height, width = y.shape[1:3]
         if min(height, width) >= SMALLEST:
             ratio = ratio * noise_factor(y, ratio, camera)
-        levels = min(LEVELS, math.ceil(math.log2(max(height, width))))
         step = 2**levels
         below, right = -height % step, -width % step
         if below or right:
@@ -366,13 +444,51 @@ class Compound(Reconstructor):
             ratio = functional.pad(ratio, (0, right, 0, below), value=torch.inf)
             if zone is not None:
                 zone = functional.pad(zone, (0, right, 0, below))
-        seen = gather_evidence(y, ratio, camera, levels, zone)
-        coefficients, amplitude, spread = self.back(seen, interval)
-        amplitude = torch.where(finite, amplitude[:, :height, :width] * lit, torch.nan)[..., None]
-        x = ((coefficients[:, :height, :width] * amplitude) @ self.basis).relu_()
-        if spread is not None:
-            spread = (spread[:, :height, :width] * amplitude) @ self.hats
-        return x, spread
+        return gather_evidence(y, ratio, camera, levels, zone)
+
+    def _evidence(
+        self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None
+    ) -> tuple[Evidence, np.ndarray]:
+        """Return what the front end says of one picture, by loops compiled for a processor.
+
+        And what brightness is multiplied by: 1 where there was light, 0 where there was none, NaN
+        where y is not finite.
+        """
+        if camera not in self._compiled:
+            self._compiled[camera] = CompiledCamera(camera)
+        matrices, threads = self._compiled[camera], torch.get_num_threads()
+        values, stated = y.contiguous().numpy(), ratio.contiguous().numpy()
+        known = compiled.light(values, threads)
+        if not known.min() > 0:
+            values = np.where(np.isnan(known)[..., None], np.float32(0), values)
+            stated = np.where(known > 0, stated, np.float32(np.inf))
+        factor = 1.0
+        if min(stated.shape) >= SMALLEST:
+            factor = compiled.noise_factor(values, stated, matrices, threads)
+        places = None if zone is None else zone.numpy()
+        seen = compiled.gather_evidence(values, stated, factor, matrices, places, threads)
+        return seen, known
+
+    def _coded(self, seen: Evidence, known: np.ndarray) -> Coded:
+        coded = refine(seen, self._networks, self.back.scale.numpy(), torch.get_num_threads())
+        height, width = known.shape
+        return replace(coded, bright=coded.bright[:height, :width] * known)
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    """Put parts one after another; one alone is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+class Told(nn.Module):
+    """A `Refiner` without its features."""
+
+    def __init__(self, network: Refiner):
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.network(x)[0]
 
 
 def _hats(bands: int) -> Tensor:

@@ -1,0 +1,25 @@
+"""``squilla export-model``: a network for other programs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def export_model(
+    calibration: Annotated[Path, typer.Option(help="Of the camera, .nc.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="ONNX file to write.")],
+    model: Annotated[str, typer.Option(help="A name of `squilla models`, or a file.")] = "mlp",
+) -> None:
+    """Write a network in the ONNX format, which ONNX Runtime, OpenVINO and phones read.
+
+    A network of single pixels takes measurements divided by their maximum, (N, filters). Of
+    `compound`, the three networks behind its front end are written, a file for each size of cells.
+
+    Example: squilla export-model --calibration camera.nc --model respecnn.safetensors -o net.onnx
+    """
+    from squilla.calibration.store import load_calibration
+    from squilla.reconstruction.reconstructor import load_model
+
+    load_model(model, load_calibration(calibration)).export(output)
+    typer.echo(f"{output}: `{model}`")

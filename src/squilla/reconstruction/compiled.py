@@ -1,0 +1,513 @@
+"""The front end of the compound model on a processor: `evidence` in loops that pass memory once.
+
+The functions of `evidence` say what is computed; these compute it for one picture at a time, in a
+third of the time, and the tests hold both together. Every kernel works on some rows of a picture
+and lets go of the interpreter's lock, so that plain threads share the rows.
+
+A view is one array, (H, W, 2 + D): noise variance, amplitude, and the shape in D directions.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from squilla.reconstruction.evidence import (
+    CORRECTED,
+    LEVELS,
+    MODEL_NOISE,
+    SPECTRAL,
+    TOLD,
+    Camera,
+    Evidence,
+)
+from squilla.reconstruction.prior import LEADING
+
+compiled = numba.njit(
+    fastmath={"reassoc", "contract", "nsz", "arcp"},
+    error_model="numpy",
+    nogil=True,
+    cache=True,
+)
+ONE, _HALF, _MODEL = np.float32(1), np.float32(0.5), np.float32(MODEL_NOISE)
+_LIKELY = np.float32(1e-6)
+"""Clusters less likely than this leave no trace in a posterior."""
+
+
+# --- sums over the channels of a cell -----------------------------------------------------------
+
+
+@compiled
+def add_product(vector, matrix, total):
+    """Add vector @ matrix to `total`; four rows at a time keep the sums in registers."""
+    rows, columns = matrix.shape
+    whole = rows - rows % 4
+    for i in range(0, whole, 4):
+        a, b, c, d = vector[i], vector[i + 1], vector[i + 2], vector[i + 3]
+        for j in range(columns):
+            total[j] += (
+                a * matrix[i, j]
+                + b * matrix[i + 1, j]
+                + c * matrix[i + 2, j]
+                + d * matrix[i + 3, j]
+            )
+    for i in range(whole, rows):
+        for j in range(columns):
+            total[j] += vector[i] * matrix[i, j]
+
+
+@compiled
+def _telling(noise, power, scale):
+    """Write the scale of `evidence._telling` and return its constant."""
+    against, product = np.float32(0), ONE
+    for i in range(TOLD):
+        share = 2 * power[i] / noise
+        scale[i] = share / ((ONE + share) * 2 * noise)
+        product *= ONE + share
+        if i % 4 == 3:  # more of them would leave the range of float32
+            against += math.log(product)
+            product = ONE
+    return _HALF * (against + math.log(product))
+
+
+@compiled
+def _difference(one, other, scale):
+    total = np.float32(0)
+    for i in range(TOLD):
+        apart = one[2 + i] - other[2 + i]
+        total += apart * apart * scale[i]
+    return total
+
+
+@compiled
+def sigmoid(x):
+    return ONE / (ONE + math.exp(-x))
+
+
+# --- from the measurement to views of every level -----------------------------------------------
+
+
+@compiled
+def _light(first, last, y, known):
+    for row in range(first, last):
+        for column in range(y.shape[1]):
+            pixel, most, total = y[row, column], np.float32(0), np.float32(0)
+            for i in range(pixel.size):
+                most = max(most, pixel[i])
+                total += pixel[i] * 0  # NaN if anything is not finite
+            known[row, column] = total + (ONE if most > 0 else np.float32(0))
+
+
+@compiled
+def _quiet_steps(first, last, y, ratio, flat, quiet, expected, steps):
+    """Write by how much neighbours differ, of what is expected; every other row."""
+    width, channels = y.shape[1:]
+    seen = np.empty((2, quiet.shape[1]), np.float32)
+    for row in range(first, last):
+        before = np.float32(np.inf)
+        for column in range(width):
+            pixel = y[2 * row, column]
+            now, then = seen[column % 2], seen[1 - column % 2]
+            amplitude, power = np.float32(0), np.float32(0)
+            for i in range(channels):
+                amplitude += pixel[i] * flat[i]
+                power += pixel[i] * pixel[i]
+            amplitude = max(amplitude, np.float32(1e-30))
+            now[:] = 0
+            add_product(pixel, quiet, now)
+            for i in range(now.size):
+                now[i] /= amplitude
+            power = ratio[2 * row, column] * (power / channels / amplitude / amplitude)
+            if column > 0:
+                total = np.float32(0)
+                for i in range(now.size):
+                    total += (now[i] - then[i]) * (now[i] - then[i])
+                expected[row, column - 1] = power + before
+                steps[row, column - 1] = total / now.size / (power + before)
+            before = power
+
+
+@compiled
+def _normalised(first, last, projected, ratio, factor, floor, channels, view):
+    """Write shape, amplitude and noise of pixels; beyond the picture nothing is known."""
+    height, width = ratio.shape
+    for row in range(first, last):
+        for column in range(view.shape[1]):
+            cell = view[row, column]
+            cell[0], cell[1], cell[2:] = np.float32(1e6), floor, np.float32(0)
+            if row >= height or column >= width:
+                continue
+            pixel = projected[row, column]
+            cell[1] = max(pixel[-1], floor)
+            power = np.float32(0)
+            for i in range(pixel.size - 1):
+                cell[2 + i] = pixel[i] / cell[1]
+                power += cell[2 + i] * cell[2 + i]
+            noise = ratio[row, column] * factor * max(power / channels, np.float32(1e-6))
+            cell[0] = min(max(noise, np.float32(1e-9)), np.float32(1e6))
+
+
+@compiled
+def _coarser(first, last, fine, view):
+    for row in range(first, last):
+        for column in range(view.shape[1]):
+            cell, weight = view[row, column], np.float32(0)
+            cell[:] = 0
+            for y in range(2):
+                for x in range(2):
+                    part = fine[2 * row + y, 2 * column + x]
+                    share = ONE / part[0]
+                    weight += share
+                    for i in range(1, cell.size):
+                        cell[i] += share * part[i]
+            for i in range(1, cell.size):
+                cell[i] /= weight
+            cell[0] = ONE / weight
+
+
+@compiled
+def _among_neighbours(first, last, view, power, known):
+    height, width, size = view.shape
+    scale = np.empty(TOLD, np.float32)
+    for row in range(first, last):
+        for column in range(width):
+            own, cell = view[row, column], known[row, column]
+            against = _telling(2 * (own[0] + _MODEL), power, scale)
+            weight = ONE / own[0]
+            for i in range(1, size):
+                cell[i] = weight * own[i]
+            for y in range(max(row - 1, 0), min(row + 2, height)):
+                for x in range(max(column - 1, 0), min(column + 2, width)):
+                    if y == row and x == column:
+                        continue
+                    other = view[y, x]
+                    share = sigmoid(against - _difference(own, other, scale)) / other[0]
+                    weight += share
+                    for i in range(1, size):
+                        cell[i] += share * other[i]
+            for i in range(1, size):
+                cell[i] /= weight
+            cell[0] = ONE / weight
+
+
+# --- what cells take from coarser ones ----------------------------------------------------------
+
+
+@compiled
+def _kinship(first, last, view, known, coarse, power, kin, alone):
+    below, right = coarse.shape[0] - 1, coarse.shape[1] - 1
+    scale = np.empty(TOLD, np.float32)
+    for row in range(first, last):
+        up, down = max((row - 1) // 2, 0), min((row + 1) // 2, below)
+        for column in range(view.shape[1]):
+            before, after = max((column - 1) // 2, 0), min((column + 1) // 2, right)
+            own, shares = view[row, column], kin[row, column]
+            around = (
+                coarse[up, before], coarse[up, after], coarse[down, before], coarse[down, after]
+            )  # fmt: skip
+            mean = (around[0][0] + around[1][0] + around[2][0] + around[3][0]) / 4
+            against = _telling(own[0] + mean + 2 * _MODEL, power, scale)
+            most = np.float32(-np.inf)
+            for number in range(4):
+                shares[number] = against - _difference(own, around[number], scale)
+                most = max(most, shares[number])
+            total = np.float32(0)
+            for number in range(4):
+                shares[number] = math.exp(shares[number] - most) / (around[number][0] + _MODEL)
+                total += shares[number]
+            for number in range(4):
+                shares[number] /= total
+            alone[row, column] = -math.log((known[row, column, 0] + _MODEL) * total) - most
+
+
+@compiled
+def mix(kin, coarse, up, down, before, after, mixed, size):
+    a, b = coarse[up, before], coarse[up, after]
+    c, d = coarse[down, before], coarse[down, after]
+    p, q, r, s = kin[0], kin[1], kin[2], kin[3]
+    for i in range(size):
+        mixed[i] = p * a[i] + q * b[i] + r * c[i] + s * d[i]
+
+
+@compiled
+def inherited(first, last, kin, coarse, mixed):
+    """Mix the four coarse cells around each cell, as many of their numbers as `mixed` has."""
+    below, right = coarse.shape[0] - 1, coarse.shape[1] - 1
+    size = mixed.shape[2]
+    for row in range(first, last):
+        up, down = max((row - 1) // 2, 0), min((row + 1) // 2, below)
+        for column in range(mixed.shape[1]):
+            before, after = max((column - 1) // 2, 0), min((column + 1) // 2, right)
+            mix(kin[row, column], coarse, up, down, before, after, mixed[row, column], size)
+
+
+@compiled
+def _besides_itself(first, last, alone, known, mixed):
+    """Mix what a cell inherits with what it knows itself."""
+    for row in range(first, last):
+        for column in range(mixed.shape[1]):
+            itself = sigmoid(alone[row, column])
+            cell, own = mixed[row, column], known[row, column]
+            for i in range(mixed.shape[2]):
+                cell[i] += itself * (own[i] - cell[i])
+
+
+# --- posteriors ---------------------------------------------------------------------------------
+
+
+@compiled
+def _divided(first, last, score, view, zone, power):
+    for row in range(first, last):
+        for column in range(score.shape[1]):
+            cell, spread = score[row, column], power[zone[row, column]]
+            noise = view[row, column, 0] + _MODEL
+            for i in range(cell.size):
+                cell[i] /= spread[i] + noise
+
+
+@compiled
+def _mixture(
+    first, last, scores, view, zone, offset, power, gain, mean, log_share, within, leading,
+    found, variance, features,
+):  # fmt: skip
+    """Write the posterior of `Estimators.mixture`; clusters without a say are left out."""
+    clusters, directions = power.shape[1:]
+    size, nodes = found.shape[2], log_share.shape[1]
+    scaled = np.empty(directions, np.float32)
+    weight = np.empty(clusters, np.float32)
+    each = np.empty((clusters, size), np.float32)
+    for row in range(first, last):
+        for column in range(found.shape[1]):
+            score, where = scores[row, column], zone[row, column]
+            noise = view[row, column, 0] + _MODEL
+            for i in range(score.size):
+                score[i] -= offset[where, i]
+            place = min(max(math.log10(noise) * 2 + 10, 0.0), nodes - 1.0)
+            low = min(int(place), nodes - 2)
+            high = np.float32(place - low)
+            most = np.float32(-np.inf)
+            for k in range(clusters):
+                misfit = np.float32(0)
+                for i in range(directions):
+                    value = score[k * directions + i]
+                    misfit += value * value / (power[where, k, i] + noise)
+                tables = log_share[where]
+                weight[k] = (ONE - high) * tables[low, k] + high * tables[low + 1, k] - misfit / 2
+                most = max(most, weight[k])
+            total = np.float32(0)
+            for k in range(clusters):
+                weight[k] = math.exp(weight[k] - most)
+                total += weight[k]
+            mixed, spread = found[row, column], variance[row, column]
+            mixed[:] = 0
+            spread[:] = 0
+            for k in range(clusters):
+                weight[k] /= total
+                if weight[k] < _LIKELY:
+                    continue
+                for i in range(directions):
+                    scaled[i] = score[k * directions + i] / (power[where, k, i] + noise)
+                each[k] = mean[where, k]
+                add_product(scaled, gain[where, k], each[k])
+                near, far = weight[k] * (ONE - high), weight[k] * high
+                one, other = within[where, low, k], within[where, low + 1, k]
+                for i in range(size):
+                    mixed[i] += weight[k] * each[k, i]
+                    spread[i] += near * one[i] + far * other[i]
+            for k in range(clusters):
+                if weight[k] >= _LIKELY:
+                    for i in range(leading):
+                        apart = each[k, i] - mixed[i]
+                        spread[i] += weight[k] * apart * apart
+            evidence = (most + math.log(total)) / directions
+            features[row, column, 0] = math.log(noise)
+            features[row, column, 1] = min(max(evidence, np.float32(-20)), np.float32(20))
+
+
+# --- all of it ----------------------------------------------------------------------------------
+
+
+class CompiledCamera:
+    """The matrices of a `Camera` as the kernels take them; one set for each zone."""
+
+    def __init__(self, camera: Camera):
+        zones = camera.zones
+        clusters = len(zones[0].cluster_power)
+
+        def stacked(name: str) -> np.ndarray:
+            return np.stack([getattr(zone, name).numpy() for zone in zones])
+
+        self.channels = np.float32(camera.channels)
+        self.project = camera.project.numpy()
+        self.flat = np.ascontiguousarray(camera.project[:, -1].numpy())
+        self.quiet, self.power = np.ascontiguousarray(camera.quiet.numpy()), camera.power.numpy()
+        self.vectors, self.spread, self.gain = map(stacked, ("vectors", "power", "gain"))
+        self.scores = stacked("scores")
+        within = stacked("within")
+        self.mixture = (
+            stacked("offset"),
+            stacked("cluster_power"),
+            stacked("cluster_gain"),
+            stacked("mean"),
+            stacked("log_share"),
+            within.reshape(len(zones), -1, clusters, within.shape[-1]),
+            LEADING,
+        )
+
+
+def light(y: np.ndarray, threads: int) -> np.ndarray:
+    """Return 1 where something was measured, 0 where all was dark, NaN where y is not finite."""
+    known = np.empty(y.shape[:2], np.float32)
+    over_rows(_light, len(y), threads, y, known)
+    return known
+
+
+def noise_factor(y: np.ndarray, ratio: np.ndarray, camera: CompiledCamera, threads: int) -> float:
+    """Return by how much a picture is noisier than it says, as `evidence.noise_factor` does."""
+    rows = (len(y) + 1) // 2
+    expected, steps = np.empty((2, rows, y.shape[1] - 1), np.float32)
+    over_rows(_quiet_steps, rows, threads, y, ratio, camera.flat, camera.quiet, expected, steps)
+    steps = steps[(expected < 1e6) & ~np.isnan(steps)]
+    if not steps.size:
+        return 1.0
+    middle = (steps.size - 1) // 2
+    factor = np.partition(steps, middle)[middle] / (1 - 2 / (9 * camera.quiet.shape[1])) ** 3
+    return float(np.clip(factor, 0.05, 20.0))
+
+
+def gather_evidence(
+    y: np.ndarray,
+    ratio: np.ndarray,
+    factor: float,
+    camera: CompiledCamera,
+    zone: np.ndarray | None,
+    threads: int,
+) -> Evidence:
+    """Do what `evidence.gather_evidence` does, for one picture.
+
+    Parameters
+    ----------
+    y : array, (H, W, M), float32, finite
+        Sides are filled up here.
+    ratio : array, (H, W), float32
+        Noise power over signal power as stated; infinite where nothing was measured.
+    factor : float
+        What `noise_factor` says of it.
+    camera : CompiledCamera
+    zone : array, (H, W), int, optional
+    threads : int
+    """
+    step = 2**LEVELS
+    sides = tuple(side + -side % step for side in ratio.shape)
+    size = camera.vectors.shape[1]
+
+    def run(kernel: Callable[..., None], rows: int, *arguments) -> None:
+        over_rows(kernel, rows, threads, *arguments)
+
+    def empty(level: int, *last: int) -> np.ndarray:
+        return np.empty((sides[0] >> level, sides[1] >> level, *last), np.float32)
+
+    views = [empty(level, size + 2) for level in range(LEVELS + 1)]
+    projected = (y.reshape(-1, y.shape[-1]) @ camera.project).reshape(*ratio.shape, -1)
+    floor = 1e-3 * np.abs(projected[..., -1]).sum(dtype=float) / (sides[0] * sides[1])
+    told = np.float32(factor), np.float32(max(floor, 1e-30)), camera.channels
+    run(_normalised, sides[0], projected, ratio, *told, views[0])
+    for level in range(1, LEVELS + 1):
+        run(_coarser, len(views[level]), views[level - 1], views[level])
+    known = [views[0]]
+    for view in views[1:]:
+        known.append(np.empty_like(view))
+        run(_among_neighbours, len(view), view, camera.power, known[-1])
+
+    best = spectral = known[-1]
+    kin, alone = {}, {}
+    for level in reversed(range(LEVELS)):
+        kin[level], alone[level] = empty(level, 4), empty(level)
+        view, rows = views[level], len(views[level])
+        run(_kinship, rows, view, known[level], best, camera.power, kin[level], alone[level])
+        mixed = empty(level, 2 + (size if level >= SPECTRAL else TOLD if level else 0))
+        run(inherited, rows, kin[level], best, mixed)
+        if level:
+            run(_besides_itself, rows, alone[level], known[level], mixed)
+        best = mixed
+        if level == SPECTRAL:
+            spectral = best
+
+    places = [_zones(zone, sides, level) for level in range(SPECTRAL + 1)]
+    coefficients = empty(SPECTRAL, camera.gain.shape[-1])
+    variance, features = np.empty_like(coefficients), empty(SPECTRAL, 2)
+    place = places[SPECTRAL]
+    run(
+        _mixture, len(spectral), _product(spectral[..., 2:], camera.scores, place), spectral,
+        place, *camera.mixture, coefficients, variance, features,
+    )  # fmt: skip
+    own = []
+    for level, (view, place) in enumerate(zip(known[:SPECTRAL], places, strict=False)):
+        score = _product(view[..., 2:], camera.vectors, place)
+        run(_divided, len(view), score, view, place, camera.spread)
+        own.append(_product(score, camera.gain[..., : CORRECTED[level]], place))
+
+    def pictures(values: Iterable[np.ndarray]) -> list[Tensor]:
+        return [torch.from_numpy(value)[None] for value in values]
+
+    finer = range(SPECTRAL)
+    mean, spread, features, bright, smooth = pictures(
+        (coefficients, variance, features, views[0][..., 1], best[..., 1])
+    )
+    return Evidence(
+        coefficients=mean,
+        variance=spread,
+        features=features,
+        kin=pictures(kin[level] for level in finer),
+        alone=pictures(alone[level] for level in finer),
+        own=pictures(own),
+        noise=pictures(known[level][..., 0] + _MODEL for level in finer),
+        amplitude=bright,
+        smooth=smooth,
+    )
+
+
+def _zones(zone: np.ndarray | None, sides: tuple[int, ...], level: int) -> np.ndarray:
+    """Return the zone of each cell of a level."""
+    if zone is None:
+        return np.zeros([side >> level for side in sides], np.int64)
+    filled = np.pad(zone, [(0, side - own) for side, own in zip(sides, zone.shape, strict=True)])
+    return filled[2**level // 2 :: 2**level, 2**level // 2 :: 2**level]
+
+
+def _product(picture: np.ndarray, matrices: np.ndarray, zone: np.ndarray) -> np.ndarray:
+    """Multiply every cell by the matrix of its zone."""
+    if len(matrices) == 1:
+        flat = picture.reshape(-1, picture.shape[-1]) @ matrices[0]
+        return flat.reshape(*zone.shape, -1)
+    product = np.empty((*zone.shape, matrices.shape[-1]), np.float32)
+    for number, matrix in enumerate(matrices):
+        cells = zone == number
+        product[cells] = picture[cells] @ matrix
+    return product
+
+
+def over_rows(kernel: Callable[..., None], rows: int, threads: int, *arguments) -> None:
+    """Call a kernel for all rows, shared by threads."""
+    # Twice as many parts as threads, since the machine may have other work; but no small ones.
+    parts = min(rows // 32, 2 * threads)
+    if threads == 1 or parts < 2:
+        kernel(0, rows, *arguments)
+        return
+    edges = [rows * number // parts for number in range(parts + 1)]
+    futures = [
+        _pool(threads).submit(kernel, first, last, *arguments) for first, last in pairwise(edges)
+    ]
+    for future in futures:
+        future.result()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="squilla-rows")
