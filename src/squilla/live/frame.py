@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Iterator
 from copy import copy
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,46 +10,8 @@ from xarray import DataArray
 
 from squilla.calibration.alignment import Measurement
 from squilla.live.answer import Answers
+from squilla.reconstruction.partial import Reconstruction
 from squilla.reconstruction.reconstructor import Reconstructor
-
-
-class Look:
-    """Works out of a measurement what is asked for: some bands, some spectra, or the whole cube.
-
-    Parameters
-    ----------
-    model : Reconstructor
-        One that cannot do with less makes the cube, once.
-    measurement : Measurement
-    """
-
-    def __init__(self, model: Reconstructor, measurement: Measurement):
-        self._model, self._measurement = model, measurement
-        self._cube: DataArray | None = None
-
-    def cube(self) -> DataArray:
-        """Return all spectra of all pixels."""
-        if self._cube is None:
-            self._cube = self._model.reconstruct(self._measurement)
-        return self._cube
-
-    def bands(self, numbers: list[int]) -> np.ndarray:
-        """Return some bands of all pixels, (H, W, bands)."""
-        some = None if self._cube is not None else self._model.only(numbers)
-        if some is None:
-            return self.cube().values[..., numbers]
-        return some.reconstruct(self._measurement).values
-
-    def spectra(self, rows: slice, columns: slice) -> np.ndarray:
-        """Return all bands of some pixels, (h, w, K)."""
-        if self._cube is not None or self._model.only([0]) is None:
-            return self.cube().values[rows, columns]
-        part = {
-            name: None if (whole := getattr(self._measurement, name)) is None else whole[place]
-            for name in ("y", "valid", "angle", "disparity", "snr")
-            for place in [(rows, columns)]
-        }
-        return self._model.reconstruct(replace(self._measurement, **part)).values
 
 
 class LiveFrame(Answers):
@@ -82,7 +43,8 @@ class LiveFrame(Answers):
         rows, columns, _ = measurement.y.shape
         super().__init__("live", (rows, columns), np.asarray(model.wavelength), {"valid": valid})
         self.number, self._told = number, told
-        self._look = Look(model, measurement)
+        self._model, self._measurement = model, measurement
+        self._looked: Reconstruction | None = None
         self._expected = [] if before is None else before._asked or before._expected
         self._asked: list[int] = []
         self._places: dict[int, tuple[int, int]] = {}  # of each decoded band
@@ -101,7 +63,7 @@ class LiveFrame(Answers):
     def cube(self) -> DataArray:
         """Return the whole reconstruction; worked out once."""
         with self._lock:
-            return self._timed(self._look.cube)
+            return self._timed(lambda look: look.cube())
 
     def blocks(
         self, rows: slice, columns: slice, bands: slice = slice(None)
@@ -111,9 +73,11 @@ class LiveFrame(Answers):
         if len(wanted) < len(self.wavelength):
             yield self._decoded(wanted)[rows, columns]
         else:
+            places = np.indices(self.shape)[:, rows, columns]
+            height, width = places.shape[1:]
             with self._lock:
-                found = self._timed(self._look.spectra, rows, columns)
-            yield found
+                found = self._timed(lambda look: look.spectra(*places.reshape(2, -1)))
+            yield found.reshape(height, width, -1)
 
     def plane(self, band: int, rows: slice, columns: slice) -> np.ndarray:
         """Return a part of one band."""
@@ -129,7 +93,7 @@ class LiveFrame(Answers):
                     for band in dict.fromkeys(self._expected + bands)
                     if band not in self._places
                 ]
-                self._planes.append(self._timed(self._look.bands, new))
+                self._planes.append(self._timed(lambda look: look.bands(new)))
                 group = len(self._planes) - 1
                 self._places |= {band: (group, at) for at, band in enumerate(new)}
             places = [self._places[band] for band in bands]
@@ -138,9 +102,11 @@ class LiveFrame(Answers):
             return self._planes[group][..., first : last + 1]
         return np.stack([self._planes[group][..., at] for group, at in places], -1)
 
-    def _timed(self, call: Callable, *arguments: Any) -> Any:
+    def _timed(self, ask: Callable[[Reconstruction], Any]) -> Any:
         start = time.perf_counter()
-        found = call(*arguments)
+        if self._looked is None:
+            self._looked = self._model.look(self._measurement)
+        found = ask(self._looked)
         stages = self._told["stages"]
         stages["decode"] = stages.get("decode", 0.0) + 1000 * (time.perf_counter() - start)
         return found

@@ -10,6 +10,7 @@ Pictures are (B, H, W, channels); level l has cells of 2^l px.
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -301,7 +302,7 @@ class Compound(Reconstructor):
     def look(self, measurement: Measurement) -> Reconstruction:
         y, angle, snr, channels = self._usable(measurement)
         if y.device.type != "cpu" or max(y.shape[:2]) <= 2 ** (LEVELS - 1):
-            return super().look(measurement)
+            return Reconstruction(self, measurement)
         camera, ratio, zone = self._told(y, angle, snr, channels)
         with torch.inference_mode():
             coded = self._coded(*self._evidence(y, ratio, camera, zone))

@@ -4,6 +4,7 @@ Who looks at a picture needs three numbers a pixel, or one spectrum, not 251 tim
 that goes with a camera asks here and leaves the cube to those who save it.
 """
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,6 +60,29 @@ class Reconstruction:
         if not all(-bands <= number < bands for number in numbers):
             raise InputError(f"The bands are numbered 0 to {bands - 1}; {numbers} reach beyond.")
         return numbers
+
+
+class PointwiseReconstruction(Reconstruction):
+    """The same where every pixel is taken by itself: some pixels, or some bands, cost less."""
+
+    def bands(self, numbers: list[int]) -> np.ndarray:
+        some = None if self._cube is not None else self._model.only(self._checked(numbers))
+        if some is None:
+            return super().bands(numbers)
+        return some.reconstruct(self._measurement).values
+
+    def spectra(self, rows: list[int], columns: list[int]) -> np.ndarray:
+        if self._cube is not None:
+            return super().spectra(rows, columns)
+        parts = {
+            name: getattr(self._measurement, name)
+            for name in ("y", "valid", "angle", "disparity", "snr")
+        }
+        few = {
+            name: None if part is None else torch.as_tensor(part)[rows, columns][None]
+            for name, part in parts.items()
+        }
+        return self._model.reconstruct(replace(self._measurement, depth=None, **few)).values[0]
 
 
 class CodedReconstruction(Reconstruction):

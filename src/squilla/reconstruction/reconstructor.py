@@ -25,7 +25,7 @@ from squilla.reconstruction.engine import (
     error,
     write_onnx,
 )
-from squilla.reconstruction.partial import Reconstruction
+from squilla.reconstruction.partial import PointwiseReconstruction, Reconstruction
 from squilla.spectra import broad_spectra
 
 if TYPE_CHECKING:
@@ -161,10 +161,7 @@ class Reconstructor(nn.Module):
         return x * factor
 
     def only(self, bands: Sequence[int]) -> "Reconstructor | None":
-        """Return what estimates these bands alone, for less; None where all cost the same.
-
-        What it can, pixels can be reconstructed without their neighbours.
-        """
+        """Return what estimates these bands alone, for less; None where all cost the same."""
         return None
 
     def with_engine(self, engine: str) -> "Reconstructor":
@@ -278,7 +275,7 @@ class Reconstructor(nn.Module):
 
     def look(self, measurement: Measurement) -> Reconstruction:
         """Return a reconstruction that works out only what is asked: bands, spectra, colours."""
-        return Reconstruction(self, measurement)
+        return PointwiseReconstruction(self, measurement)
 
     def labelled(
         self, cube: np.ndarray, measurement: Measurement, scale: Scale = "consistent"
