@@ -34,7 +34,6 @@ from squilla.calibration.rehearsal import Rehearsal
 from squilla.calibration.views import evened, sub_images
 from squilla.camera.twin import Camera
 from squilla.files.raw import Raw
-from squilla.live.frame import Look
 from squilla.live.pipeline import LiveSource
 from squilla.live.source import Counts, MovingTwin
 from squilla.live.twin_camera import camera_within
@@ -150,12 +149,12 @@ def stages(calibration, raws: list[Raw], models: dict) -> dict[str, float]:
         "measure, from nothing": lambda: measure(raws[1], calibration),
     }
     wanted = [*range(0, 251, 7), *SHOWN]
-    point = slice(100, 101), slice(100, 101)
     for name, model in models.items():
-        if model.only([0]) is not None:
-            steps[f"{name}: colour and three bands"] = lambda m=model: Look(m, first).bands(wanted)
-            steps[f"{name}: spectrum of a point"] = lambda m=model: Look(m, first).spectra(*point)
-        steps[f"{name}: whole cube"] = lambda m=model: Look(m, first).cube()
+        steps |= {
+            f"{name}: colour and three bands": lambda m=model: m.look(first).bands(wanted),
+            f"{name}: spectrum of a point": lambda m=model: m.look(first).spectra([100], [100]),
+            f"{name}: whole cube": lambda m=model: m.look(first).cube(),
+        }
     found = {}
     for name, call in steps.items():
         call()

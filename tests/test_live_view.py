@@ -81,13 +81,13 @@ def test_a_live_frame_is_what_measuring_and_reconstructing_give(live, frames, ca
     cube = model.reconstruct(measured).values
     picture, _ = frame.picture(Picture(kind="band", band=7))
     assert np.sqrt(np.mean((picture[0] - cube[..., 7]) ** 2)) < 1e-3 * cube[..., 7].mean()
-    cube = model.reconstruct(frame._look._measurement).values
+    cube = model.reconstruct(frame._measurement).values
     np.testing.assert_allclose(picture[0], cube[..., 7], rtol=1e-5)
     (mean, spread), _ = frame.spectra(Spectra(regions=[(10, 20, 11, 21), (30, 30, 40, 36)]))
     np.testing.assert_allclose(mean[0], cube[10, 20], rtol=1e-5)
     np.testing.assert_allclose(mean[1], cube[30:40, 30:36].mean((0, 1)), rtol=1e-5)
     np.testing.assert_allclose(spread[1], cube[30:40, 30:36].std((0, 1)), rtol=1e-3, atol=1e-5)
-    assert frame._look._cube is None, "nobody asked for the whole cube"
+    assert frame._looked._cube is None, "nobody asked for the whole cube"
     colour, _ = frame.picture(Picture(kind="colour"))
     bands = colour_bands(51)
     expected = np.moveaxis(cube[..., bands] @ rgb_weights(model.wavelength[bands]), -1, 0)
@@ -105,12 +105,12 @@ def test_what_was_asked_of_a_frame_is_expected_of_the_next(live, monkeypatch):
     first = live.now()
     first.picture(Picture(kind="band", band=3))
     first.picture(Picture(kind="band", band=9))
-    second = LiveFrame(99, first._look._measurement, first._look._model, {"stages": {}}, first)
+    second = LiveFrame(99, first._measurement, first._model, {"stages": {}}, first)
     second.picture(Picture(kind="band", band=9))
     assert second._places.keys() == {3, 9}
-    third = LiveFrame(100, first._look._measurement, first._look._model, {"stages": {}}, second)
+    third = LiveFrame(100, first._measurement, first._model, {"stages": {}}, second)
     third.picture(Picture(kind="band", band=9))
-    fourth = LiveFrame(101, first._look._measurement, first._look._model, {"stages": {}}, third)
+    fourth = LiveFrame(101, first._measurement, first._model, {"stages": {}}, third)
     fourth.picture(Picture(kind="band", band=5))
     assert fourth._places.keys() == {5, 9}, "what nobody asks for any more is left"
 
