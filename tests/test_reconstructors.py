@@ -355,6 +355,7 @@ def test_weights_refuse_another_camera(saved):
 
 
 def test_damaged_and_foreign_files_are_refused(saved, tmp_path):
+    from safetensors import safe_open
     from safetensors.torch import save_file
 
     content = saved.read_bytes()
@@ -368,6 +369,12 @@ def test_damaged_and_foreign_files_are_refused(saved, tmp_path):
     with pytest.raises(InputError, match="not a model of squilla"):
         load_model(broken, CAMERA)
     broken.write_bytes(content.replace(b"layers.0.weight", b"layers.0.wrongs"))
+    with pytest.raises(InputError, match="checksum"):
+        load_model(broken, CAMERA)
+    with safe_open(saved, "pt") as file:
+        metadata = {key: text for key, text in file.metadata().items() if key != "checksum"}
+        tensors = {name.replace("weight", "wrongs"): file.get_tensor(name) for name in file.keys()}
+    save_file(tensors, broken, metadata)
     with pytest.raises(InputError, match="other weights"):
         load_model(broken, CAMERA)
     broken.write_bytes(content.replace(b"500,500", b"250,999", 1))
