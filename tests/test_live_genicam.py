@@ -108,9 +108,7 @@ def test_from_the_wire_to_the_page(opened, twin, frames, calibration):
 
 
 @installed
-def test_an_unplugged_camera_is_said_and_comes_back(
-    frames, calibration, port, capfd
-):
+def test_an_unplugged_camera_is_said_and_comes_back(frames, calibration, port, capfd):
     model = load_model("ridge", calibration)
     with TwinCamera(frames, rate=20.0) as twin:
         camera = open_source(HERE, "thesis", "chart")

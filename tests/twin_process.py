@@ -12,7 +12,6 @@ from squilla.live import aravis
 from squilla.live.twin_camera import TwinCamera
 from squilla.live.twin_frames import TwinFrames
 
-
 try:
     aravis.load()
     missing = ""

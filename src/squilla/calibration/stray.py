@@ -55,7 +55,7 @@ def stray_light(
     }
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
 def _levels(frame, bias, dark_rate, exposure, blocks, level):
     for number in numba.prange(len(blocks)):
         y, x = blocks[number]

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -12,6 +13,7 @@ from xarray import DataArray
 from squilla.calibration.alignment import Measurement
 from squilla.live.answer import Answers
 from squilla.reconstruction.reconstructor import Reconstructor
+
 
 class Look:
     """Works out of a measurement what is asked for: some bands, some spectra, or the whole cube.
@@ -63,6 +65,8 @@ class LiveFrame(Answers):
     model : Reconstructor
     told : dict
         What the page shows of the frame; the time of reconstruction is added.
+    turn : context manager
+        Entered while reconstructing, where that must not go on beside other work.
     before : LiveFrame, optional
         What was asked of the frame before is expected to be asked of this one too.
     """
@@ -75,12 +79,13 @@ class LiveFrame(Answers):
         measurement: Measurement,
         model: Reconstructor,
         told: dict[str, Any],
+        turn: AbstractContextManager,
         before: "LiveFrame | None" = None,
     ):
         valid = DataArray(measurement.valid.all(-1).numpy(), dims=("y", "x"))
         rows, columns, _ = measurement.y.shape
         super().__init__("live", (rows, columns), np.asarray(model.wavelength), {"valid": valid})
-        self.number, self._told = number, told
+        self.number, self._told, self._turn = number, told, turn
         self._look = Look(model, measurement)
         self._expected = [] if before is None else before._asked or before._expected
         self._asked: list[int] = []
@@ -139,7 +144,8 @@ class LiveFrame(Answers):
 
     def _timed(self, call: Callable, *arguments: Any) -> Any:
         start = time.perf_counter()
-        found = call(*arguments)
+        with self._turn:
+            found = call(*arguments)
         stages = self._told["stages"]
         stages["decode"] = stages.get("decode", 0.0) + 1000 * (time.perf_counter() - start)
         return found
