@@ -8,8 +8,8 @@ from collections import deque
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
-import numba
 import numpy as np
+from numba.np.ufunc.parallel import threading_layer
 
 from squilla.calibration.alignment import Measurement, measure
 from squilla.calibration.calibration import Calibration
@@ -200,7 +200,7 @@ class LiveSource:
                 raw, self._calibration, distance=self._distance, start=self._last_placed()
             )
         spent = time.perf_counter() - start
-        if numba.threading_layer() == "workqueue" and not self._number:
+        if not self._number and threading_layer() == "workqueue":
             self._turn = threading.Lock()  # that pool of threads serves one at a time, or ends us
         self._times.append(time.monotonic())
         provenance = measurement.provenance
