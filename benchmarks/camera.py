@@ -120,7 +120,7 @@ def in_process(frames: TwinFrames) -> dict[str, float]:
 
 
 def lossy(seconds: float = 60.0) -> dict[str, float]:
-    """Read from a camera of which 5 % of the packets get lost; whole frames are as they were sent."""
+    """Read from a camera that loses 5 % of its packets; whole frames must be as they were sent."""
     frames = twin_process.megapixel_frames()
     with TwinCamera(frames, rate=25.0, lost=0.05) as twin, open_camera(HERE) as camera:
         camera.region = Region(100, 1000)  # 19 packets of data: one frame in three is whole

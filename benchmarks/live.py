@@ -2,18 +2,18 @@
 
     python benchmarks/live.py [--calibration camera.nc] [-o experiments/results/live.json]
 
-A client in a process of its own talks to the real server over a real WebSocket, watches colour,
-three bands and the spectra of two points and a region, and acknowledges as the page does. Frames
-come ready from memory, from the twin that draws new noise for each, and from the twin as a GenICam
-camera within the process (Mono12p, packed and unpacked). Without --calibration the thesis' camera
-is calibrated first, which takes some minutes.
+A client in a process of its own (`tests/watching.py`) talks to the real server over a real
+WebSocket, watches colour, three bands and the spectra of two points and a region, and acknowledges
+as the page does. Frames come ready from memory, from the twin that draws new noise for each, and
+from the twin as a GenICam camera within the process (Mono12p, packed and unpacked). Without
+--calibration the thesis' camera is calibrated first, which takes some minutes.
 """
 
 import argparse
 import json
-import multiprocessing
 import os
 import platform
+import subprocess
 import sys
 import time
 import warnings
@@ -35,17 +35,15 @@ from squilla.calibration.views import evened, sub_images
 from squilla.camera.twin import Camera
 from squilla.files.raw import Raw
 from squilla.live.pipeline import LiveSource
-from squilla.live.source import Counts, MovingTwin
+from squilla.live.source import Counts, FrameSource
 from squilla.live.twin_camera import camera_within
 from squilla.live.twin_frames import TwinFrames, views
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
+import watching
 from browser import Browser, find
-from serving import Line, running
-
-SHOWN = (160, 80, 0)  # 660, 580, 500 nm of 251 bands
-PLACES = [[100, 100, 101, 101], [20, 200, 21, 201], [120, 60, 130, 70]]
+from serving import running
 
 
 class Ready:
@@ -65,38 +63,26 @@ class Ready:
         return self.raws[self.statistics.delivered % len(self.raws)]
 
 
-def look(address: str, seconds: float, pipe) -> None:
-    """Be a page: watch, acknowledge, note when frames were complete."""
-    line = Line(address)
-    pictures = [{"kind": "colour"}, *({"kind": "band", "band": band} for band in SHOWN)]
-    wanted = [*pictures, {"ask": "spectra", "regions": PLACES}]
-    line.socket.send(json.dumps({"ask": "watch", "wanted": wanted}))
-    times, stages, end = [], [], None
-    while end is None or time.perf_counter() < end:
-        header, _ = line.receive()
-        if not header.get("last"):
-            assert "error" not in header, header
-            continue
-        line.socket.send(json.dumps({"ask": "acknowledge", "frame": header["frame"]}))
-        times.append(time.perf_counter())
-        stages.append(header["status"]["stages"])
-        if len(times) == 8:  # warm
-            end, times, stages = time.perf_counter() + seconds, times[-1:], []
-    line.socket.close()
-    pipe.send((times, stages))
+class Drawn(Ready):
+    """The twin before a scene that stands still: new noise for each frame."""
+
+    def __init__(self, raws: list[Raw], frames: TwinFrames):
+        super().__init__(raws)
+        self.frames = frames
+
+    def read(self, *, timeout: float = 5.0) -> Raw:
+        self.statistics.delivered += 1
+        frame = self.frames.draw(self.statistics.delivered, self.exposure)
+        return Raw(frame, self.exposure, self.raws[0].metadata)
 
 
 def watched(source, calibration, model, seconds: float) -> dict[str, float]:
     """Return frames a second and the median time of each stage, as a client over the wire sees."""
     with closing(LiveSource(source, calibration, model)) as live, running(live) as address:
         live.now()
-        ours, theirs = multiprocessing.Pipe()
-        client = multiprocessing.get_context("spawn").Process(
-            target=look, args=(address, seconds, theirs)
-        )
-        client.start()
-        times, stages = ours.recv()
-        client.join()
+        command = [sys.executable, watching.__file__, address, str(seconds)]
+        told = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
+    times, stages = json.loads(told)
     result = {"frames_per_s": (len(times) - 1) / (times[-1] - times[0])}
     for name in ("frame", "measure", "decode", "answer", "send", "page"):
         result[name] = median(each.get(name, 0.0) for each in stages)
@@ -117,13 +103,15 @@ def painted(source, calibration, model, seconds: float) -> float:
 
 
 @contextmanager
-def sources(camera: Camera, raws: list[Raw], rates) -> Iterator[dict[str, Callable]]:
-    frames = TwinFrames(camera, rates)
+def sources(raws: list[Raw], frames: TwinFrames) -> Iterator[dict[str, FrameSource]]:
+    """Open the cameras."""
     with camera_within(frames, rate=100.0) as aravis:
-        aravis.exposure = frames.bright_exposure / 20
-        moving = MovingTwin(camera, "chart", rate=100.0)
-        moving.exposure = moving.exposure / 20  # no longer than a frame
-        yield {"ready in memory": Ready(raws), "twin": moving, "twin over GenICam": aravis}
+        aravis.exposure = frames.bright_exposure / 20  # which the simulator waits for
+        yield {
+            "ready in memory": Ready(raws),
+            "twin": Drawn(raws, frames),
+            "twin over GenICam": aravis,
+        }
 
 
 def stages(calibration, raws: list[Raw], models: dict) -> dict[str, float]:
@@ -148,7 +136,7 @@ def stages(calibration, raws: list[Raw], models: dict) -> dict[str, float]:
         "measure, from the frame before": lambda: measure(raws[1], calibration, start=first),
         "measure, from nothing": lambda: measure(raws[1], calibration),
     }
-    wanted = [*range(0, 251, 7), *SHOWN]
+    wanted = [*range(0, 251, 7), *watching.BANDS]
     for name, model in models.items():
         steps |= {
             f"{name}: colour and three bands": lambda m=model: m.look(first).bands(wanted),
@@ -187,8 +175,7 @@ def main() -> None:
             camera.design, dark=rehearsal.dark(), flat=rehearsal.flat(), sweep=rehearsal.sweep(),
             target=rehearsal.target(), target_distance=rehearsal.distance,
         )  # fmt: skip
-    rates = list(views(camera, "chart"))
-    frames = TwinFrames(camera, rates)
+    frames = TwinFrames(camera, views(camera, "chart"))
     exposure = frames.bright_exposure
     raws = [Raw(frames.draw(n, exposure), exposure, {"camera": camera.serial}) for n in range(4)]
     models = {name: squilla.load_model(name, calibration) for name in given.models}
@@ -203,7 +190,7 @@ def main() -> None:
     print("\n| source, model | frames/s | read | measure | decode | answer | send | page |")
     print("|" + "---|" * 8)
     results["live"] = {}
-    with sources(camera, raws, rates) as there:
+    with sources(raws, frames) as there:
         for kind, source in there.items():
             for name, model in models.items():
                 seen = watched(source, calibration, model, given.seconds)

@@ -4,6 +4,7 @@ import errno
 import json
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -101,22 +102,30 @@ def test_a_live_frame_is_what_measuring_and_reconstructing_give(live, frames, ca
     assert {"frame", "measure", "decode"} <= told["stages"].keys()
 
 
-def test_what_was_asked_of_a_frame_is_expected_of_the_next(live, monkeypatch):
-    first = live.now()
-    first.picture(Picture(kind="band", band=3))
-    first.picture(Picture(kind="band", band=9))
-    second = LiveFrame(99, first._measurement, first._model, {"stages": {}}, first)
-    second.picture(Picture(kind="band", band=9))
+def test_what_was_asked_of_a_frame_is_expected_of_the_next(live):
+    shown = live.now()
+
+    def frame(before: LiveFrame | None) -> LiveFrame:
+        return LiveFrame(9, shown._measurement, shown._model, {"stages": {}}, nullcontext(), before)
+
+    def band(frame: LiveFrame, number: int) -> None:
+        frame.picture(Picture(kind="band", band=number))
+
+    first = frame(None)
+    band(first, 3)
+    band(first, 9)
+    second = frame(first)
+    band(second, 9)
     assert second._places.keys() == {3, 9}
-    third = LiveFrame(100, first._measurement, first._model, {"stages": {}}, second)
-    third.picture(Picture(kind="band", band=9))
-    fourth = LiveFrame(101, first._measurement, first._model, {"stages": {}}, third)
-    fourth.picture(Picture(kind="band", band=5))
+    third = frame(second)
+    band(third, 9)
+    fourth = frame(third)
+    band(fourth, 5)
     assert fourth._places.keys() == {5, 9}, "what nobody asks for any more is left"
 
 
 def reads(source: LiveSource, count: int) -> None:
-    """Wait until so many more frames were taken off the camera; what was under way is then shown."""
+    """Wait until so many more frames left the camera; what was under way is then shown."""
     before = source._source.statistics.delivered
     until(lambda: source._source.statistics.delivered >= before + count)
 

@@ -123,7 +123,7 @@ def _derivative(smooth: float) -> tuple[np.ndarray, np.ndarray]:
     return bell.astype(np.float32), slope.astype(np.float32)
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
 def _gradient(images, bad, step, bell, slope, values, wrong):
     units, rows, columns = images.shape
     _, _, height, _width = values.shape
@@ -173,7 +173,7 @@ def _gradient(images, bad, step, bell, slope, values, wrong):
             x[n], y[n] = x[n] * good, y[n] * good
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
 def _scale(values, wrong):
     """Scale every unit to unit mean square over its good points."""
     _, units, rows, columns = values.shape
@@ -187,7 +187,7 @@ def _scale(values, wrong):
         values[:, unit] *= np.float32(1 / np.sqrt(energy / count + 1e-30))
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
 def _double_angle(gradients, bad, floor, values, wrong):
     """Fill in means of the double angle over 3 x 3 points around every second point."""
     _, units, rows, columns = gradients.shape

@@ -108,7 +108,7 @@ def _weigh(kernel, fraction, weights):
             weight[k] = a + t * (b + t * (c + t * (d + t * (e + t * f))))
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True, error_model="numpy")
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _resample(images, bad, place, baseline, disparity, kernel, values, valid):
     channels, units, rows, columns = images.shape
     height, width = disparity.shape

@@ -63,7 +63,7 @@ def dark_levels(
     return level
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
 def _levels(frame, bias, dark_rate, exposure, blocks, level):
     for number in numba.prange(len(blocks)):
         y, x = blocks[number]

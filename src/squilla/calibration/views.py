@@ -51,7 +51,7 @@ def sub_images(raw: Raw, lattice: Lattice, pixels: Pixels, margin: int) -> SubIm
     return SubImages(torch.from_numpy(image), torch.from_numpy(bad), offset, margin, share)
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, cache=True, nogil=True)
 def _correct(
     frame, bias, rate, exposure, flat, valid, saturation, origin, image, bad, saturated
 ):  # fmt: skip
@@ -79,7 +79,7 @@ def _correct(
         saturated[unit, row] = count
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(parallel=True, cache=True, nogil=True)
 def fill(image, bad):
     """Put the mean of its good neighbours into each bad pixel of (M, H, W) pictures."""
     units, rows, columns = image.shape
@@ -155,7 +155,7 @@ def evened(views: SubImages, lattice: Lattice, calibration: Calibration) -> SubI
     return replace(views, image=torch.from_numpy(image))
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
 def _even(image, middle, reach, fit, even):
     units, rows, columns = image.shape
     for line in numba.prange(units * rows):

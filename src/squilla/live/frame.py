@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from copy import copy
 from typing import Any
 
@@ -25,6 +26,8 @@ class LiveFrame(Answers):
     model : Reconstructor
     told : dict
         What the page shows of the frame; the time of reconstruction is added.
+    turn : context manager
+        Entered while reconstructing, where that must not go on beside other work.
     before : LiveFrame, optional
         What was asked of the frame before is expected to be asked of this one too.
     """
@@ -37,12 +40,13 @@ class LiveFrame(Answers):
         measurement: Measurement,
         model: Reconstructor,
         told: dict[str, Any],
+        turn: AbstractContextManager,
         before: "LiveFrame | None" = None,
     ):
         valid = DataArray(measurement.valid.all(-1).numpy(), dims=("y", "x"))
         rows, columns, _ = measurement.y.shape
         super().__init__("live", (rows, columns), np.asarray(model.wavelength), {"valid": valid})
-        self.number, self._told = number, told
+        self.number, self._told, self._turn = number, told, turn
         self._model, self._measurement = model, measurement
         self._looked: Reconstruction | None = None
         self._expected = [] if before is None else before._asked or before._expected
@@ -104,9 +108,10 @@ class LiveFrame(Answers):
 
     def _timed(self, ask: Callable[[Reconstruction], Any]) -> Any:
         start = time.perf_counter()
-        if self._looked is None:
-            self._looked = self._model.look(self._measurement)
-        found = ask(self._looked)
+        with self._turn:
+            if self._looked is None:
+                self._looked = self._model.look(self._measurement)
+            found = ask(self._looked)
         stages = self._told["stages"]
         stages["decode"] = stages.get("decode", 0.0) + 1000 * (time.perf_counter() - start)
         return found

@@ -5,9 +5,11 @@ import time
 import traceback
 import warnings
 from collections import deque
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
+from numba.np.ufunc.parallel import threading_layer
 
 from squilla.calibration.alignment import Measurement, measure
 from squilla.calibration.calibration import Calibration
@@ -69,6 +71,7 @@ class LiveSource:
         self._frame: LiveFrame | None = None
         self._trouble: str | None = None
         self._said, self._automatic = 0.0, False
+        self._turn: AbstractContextManager = nullcontext()
         self._frozen, self._step = False, threading.Event()
         self._looked = time.monotonic()
         self._times: deque[float] = deque(maxlen=20)
@@ -191,12 +194,14 @@ class LiveSource:
 
     def _publish(self, raw: Raw, taken: float) -> None:
         start = time.perf_counter()
-        with warnings.catch_warnings(record=True) as warned:
+        with self._turn, warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always", UserWarning)
             self._before = measurement = measure(
                 raw, self._calibration, distance=self._distance, start=self._last_placed()
             )
         spent = time.perf_counter() - start
+        if not self._number and threading_layer() == "workqueue":
+            self._turn = threading.Lock()  # that pool of threads serves one at a time, or ends us
         self._times.append(time.monotonic())
         provenance = measurement.provenance
         told = self._status(raw) | {
@@ -207,7 +212,7 @@ class LiveSource:
             "stages": {"frame": 1000 * taken, "measure": 1000 * spent},
         }
         self._number += 1
-        frame = LiveFrame(self._number, measurement, self._model, told, self._frame)
+        frame = LiveFrame(self._number, measurement, self._model, told, self._turn, self._frame)
         if self._recorder is not None and self._recorder.running:
             self._recorder.offer(raw, frame.cube)
         self._frame = frame

@@ -42,7 +42,8 @@ class StoredCube(Answers):
         title: str = "cube",
         held: int = HELD,
     ):
-        super().__init__(title, cube.shape[:2], cube["wavelength"].values, extra or {})
+        rows, columns, _ = cube.shape
+        super().__init__(title, (rows, columns), cube["wavelength"].values, extra or {})
         self.cube = cube
         self.whole = self._held = 4 * cube.size <= held
         # Each band a piece of disk of its own.
