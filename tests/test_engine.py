@@ -117,6 +117,20 @@ def test_every_engine_gives_what_torch_gives(network, name, most):
     np.testing.assert_array_equal(again[known], expected[known])
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU; run there")
+@pytest.mark.parametrize(("name", "most"), [("cuda", 1e-4), ("cuda-bf16", 0.03)])
+def test_a_recorded_graph_gives_what_it_was_recorded_from(name, most):
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.Linear(20, 64), torch.nn.ReLU(), torch.nn.Linear(64, 8))
+    run = engine.compile_network(network, name)
+    for pixels in (100, 3, 100):
+        inputs = np.random.default_rng(pixels).normal(size=(pixels, 20)).astype(np.float32)
+        found = run(inputs)
+        with torch.inference_mode():
+            expected = network(torch.from_numpy(inputs).cuda()).cpu().numpy()
+        assert engine.error(found, expected) < most
+
+
 @needs("openvino")
 def test_openvino_computes_in_float32_unless_told():
     """By itself it would take bfloat16, an error of 1e-3 and more, where the processor has it."""

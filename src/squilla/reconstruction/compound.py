@@ -226,10 +226,7 @@ class Compound(Reconstructor):
         self.register_buffer("hats", hats, persistent=False)
         self._cameras: dict[tuple[bool, ...], tuple[Camera, Camera]] = {}
         self._compiled: dict[Camera, CompiledCamera] = {}
-        self._networks = self._made("torch")
-
-    def _made(self, engine: str) -> list[Network]:
-        return [compile_network(Told(network), engine) for network in self.back.networks()]
+        self._networks: list[Network] | None = None
 
     def _take(self, engine: str) -> None:
         if engine.startswith("cuda"):
@@ -237,7 +234,10 @@ class Compound(Reconstructor):
                 "`compound` runs on a GPU as it is: call model.to('cuda'). Engines are for the "
                 "other networks there."
             )
-        self._networks = self._made(engine)
+        self._networks = None if engine == "torch" else self._made(engine)
+
+    def _made(self, engine: str) -> list[Network]:
+        return [compile_network(Told(network), engine) for network in self.back.networks()]
 
     @classmethod
     def for_weights(cls, calibration: Calibration, weights: Mapping[str, Tensor]) -> "Compound":
@@ -458,7 +458,7 @@ class Compound(Reconstructor):
         if camera not in self._compiled:
             self._compiled[camera] = CompiledCamera(camera)
         matrices, threads = self._compiled[camera], torch.get_num_threads()
-        values, stated = y.contiguous().numpy(), ratio.contiguous().numpy()
+        values, stated = (each.detach().contiguous().numpy() for each in (y, ratio))
         known = compiled.light(values, threads)
         if not known.min() > 0:
             values = np.where(np.isnan(known)[..., None], np.float32(0), values)
@@ -471,7 +471,8 @@ class Compound(Reconstructor):
         return seen, known
 
     def _coded(self, seen: Evidence, known: np.ndarray) -> Coded:
-        coded = refine(seen, self._networks, self.back.scale.numpy(), torch.get_num_threads())
+        networks = self._networks or self._made("torch")
+        coded = refine(seen, networks, self.back.scale.numpy(), torch.get_num_threads())
         height, width = known.shape
         return replace(coded, bright=coded.bright[:height, :width] * known)
 
