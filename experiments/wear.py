@@ -44,7 +44,6 @@ FAULTS = {
     "sensor 40 K warmer": Wear(warmer=40.0),
     "light leaks in": Wear(leak=10.0),
     "filters 1 nm to the red": Wear(drift=1.0),
-    "filters 3 nm to the red": Wear(drift=3.0),
     "80 rows empty": Wear(),
     "80 rows stale": Wear(),
 }
@@ -83,11 +82,15 @@ def of(kind: str, wear: Wear) -> dict:
         raw = drop_rows(raw, 1450, 80, repeated="stale" in kind)
     truth = camera.truth(scene).cube.values
     found: dict = {}
-    rehearsal = Rehearsal(camera, seed=9, frames=4)
-    today = check(calibration, dark=rehearsal.dark(), flat=rehearsal.flat())
+    mended, says = calibration, []
+    if "rows" not in kind:  # those are of one frame, and no wear that flats could show
+        rehearsal = Rehearsal(camera, seed=9, frames=4)
+        today = check(calibration, dark=rehearsal.dark(), flat=rehearsal.flat())
+        mended, says = today.mended(calibration), today.says
+        found["drift"] = [today.drift, today.drift_error]
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        for name, own in (("after", calibration), ("checked", today.mended(calibration))):
+        for name, own in (("after", calibration), ("checked", mended)):
             measurement = measure(raw, own)
             cube = load_model("ridge", own).reconstruct(measurement)
             found[name] = error(cube, truth)
@@ -97,8 +100,7 @@ def of(kind: str, wear: Wear) -> dict:
         with nobody_looks():
             cube = load_model("ridge", calibration).reconstruct(measure(raw, calibration))
     found["before"] = error(cube, truth)
-    found["check_says"] = today.says
-    found["drift"] = [today.drift, today.drift_error]
+    found["check_says"] = says
     return found
 
 
