@@ -141,7 +141,14 @@ def page(results: dict) -> str:
         rows.append(
             f"| {kind} | {by} | {one['before']:.4f} | {one['after']:.4f} | {one['checked']:.4f} |"
         )
-    light = results["flats in a flickering lamp"]
+    lamp = ""
+    if "flats in a flickering lamp" in results:
+        light = results["flats in a flickering lamp"]
+        lamp = (
+            f" A lamp that changes by {light['light_change']:.0%} between the flats made the gain "
+            f"{light['before']:.2f} e-/DN instead of {light['true']:.2f}; evened out, it is "
+            f"{light['after']:.2f}."
+        )
     said = [f"- {kind}: {' '.join(results[kind]['says'])}" for kind in FAULTS if kind in results
             and results[kind]["says"]]  # fmt: skip
     text = PAGE.read_text()
@@ -152,10 +159,7 @@ def page(results: dict) -> str:
             "|---|---|---|---|---|",
             *rows,
             "",
-            f"Without any fault the error is {sound:.4f}. A lamp that changes by "
-            f"{light['light_change']:.0%} between the flats made the gain "
-            f"{light['before']:.2f} e-/DN instead of {light['true']:.2f}; evened out, it is "
-            f"{light['after']:.2f}.",
+            f"Without any fault the error is {sound:.4f}.{lamp}",
             "",
             "What `measure` says of each:",
             "",
