@@ -79,7 +79,7 @@ def of(kind: str, wear: Wear) -> dict:
     exposure = sound.sensor.exposure_for(sound._fields(sound.rate(scene)), SNR)
     raw = camera.expose(camera.rate(scene), exposure, torch.Generator().manual_seed(3))
     if "rows" in kind:
-        raw = drop_rows(raw, 1450, 80, repeated="stale" in kind)
+        raw = drop_rows(raw, 1270, 80, repeated="stale" in kind)
     truth = camera.truth(scene).cube.values
     found: dict = {}
     mended, says = calibration, []
