@@ -44,7 +44,6 @@ FAULTS = {
     "sensor 40 K warmer": Wear(warmer=40.0),
     "light leaks in": Wear(leak=10.0),
     "filters 1 nm to the red": Wear(drift=1.0),
-    "filters 3 nm to the red": Wear(drift=3.0),
     "80 rows empty": Wear(),
     "80 rows stale": Wear(),
 }
@@ -80,14 +79,18 @@ def of(kind: str, wear: Wear) -> dict:
     exposure = sound.sensor.exposure_for(sound._fields(sound.rate(scene)), SNR)
     raw = camera.expose(camera.rate(scene), exposure, torch.Generator().manual_seed(3))
     if "rows" in kind:
-        raw = drop_rows(raw, 1450, 80, repeated="stale" in kind)
+        raw = drop_rows(raw, 1270, 80, repeated="stale" in kind)
     truth = camera.truth(scene).cube.values
     found: dict = {}
-    rehearsal = Rehearsal(camera, seed=9, frames=4)
-    today = check(calibration, dark=rehearsal.dark(), flat=rehearsal.flat())
+    mended, says = calibration, []
+    if "rows" not in kind:  # those are of one frame, and no wear that flats could show
+        rehearsal = Rehearsal(camera, seed=9, frames=4)
+        today = check(calibration, dark=rehearsal.dark(), flat=rehearsal.flat())
+        mended, says = today.mended(calibration), today.says
+        found["drift"] = [today.drift, today.drift_error]
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        for name, own in (("after", calibration), ("checked", today.mended(calibration))):
+        for name, own in (("after", calibration), ("checked", mended)):
             measurement = measure(raw, own)
             cube = load_model("ridge", own).reconstruct(measurement)
             found[name] = error(cube, truth)
@@ -97,8 +100,7 @@ def of(kind: str, wear: Wear) -> dict:
         with nobody_looks():
             cube = load_model("ridge", calibration).reconstruct(measure(raw, calibration))
     found["before"] = error(cube, truth)
-    found["check_says"] = today.says
-    found["drift"] = [today.drift, today.drift_error]
+    found["check_says"] = says
     return found
 
 
@@ -139,7 +141,14 @@ def page(results: dict) -> str:
         rows.append(
             f"| {kind} | {by} | {one['before']:.4f} | {one['after']:.4f} | {one['checked']:.4f} |"
         )
-    light = results["flats in a flickering lamp"]
+    lamp = ""
+    if "flats in a flickering lamp" in results:
+        light = results["flats in a flickering lamp"]
+        lamp = (
+            f" A lamp that changes by {light['light_change']:.0%} between the flats made the gain "
+            f"{light['before']:.2f} e-/DN instead of {light['true']:.2f}; evened out, it is "
+            f"{light['after']:.2f}."
+        )
     said = [f"- {kind}: {' '.join(results[kind]['says'])}" for kind in FAULTS if kind in results
             and results[kind]["says"]]  # fmt: skip
     text = PAGE.read_text()
@@ -150,10 +159,7 @@ def page(results: dict) -> str:
             "|---|---|---|---|---|",
             *rows,
             "",
-            f"Without any fault the error is {sound:.4f}. A lamp that changes by "
-            f"{light['light_change']:.0%} between the flats made the gain "
-            f"{light['before']:.2f} e-/DN instead of {light['true']:.2f}; evened out, it is "
-            f"{light['after']:.2f}.",
+            f"Without any fault the error is {sound:.4f}.{lamp}",
             "",
             "What `measure` says of each:",
             "",

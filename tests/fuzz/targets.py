@@ -2,7 +2,6 @@
 
 import io
 import json
-import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping
@@ -189,7 +188,7 @@ def _toml_filters() -> list[bytes]:
 
 _MATRIX = np.stack([WAVELENGTH, *np.linspace(0.1, 0.9, 10).reshape(2, 5)], -1)
 _CSV = "wavelength,a,b\n" + "\n".join(",".join(f"{v:g}" for v in row) for row in _MATRIX)
-_NK = "wl,n\n0.4,1.5\n0.5,1.49\n0.8,1.47\n"
+_NK = "wl,n\n400,1.5\n500,1.49\n800,1.47\n"
 _YAML = """DATA:
   - type: formula 1
     wavelength_range: 0.3 1.0
@@ -205,10 +204,12 @@ def _npz_filters() -> list[bytes]:
     return [_saved(np.savez, values=_MATRIX[:, 1:].T.copy(), wavelength=WAVELENGTH)]
 
 
-_ZARR_PARTS = {
-    f"f.zarr/{part}": _zarr(f"f.zarr/{part}")
-    for part in ("zarr.json", "radiance/zarr.json", "wavelength/zarr.json", "wavelength/c/0")
-}
+def _mat_filters() -> list[bytes]:
+    from scipy.io import savemat
+
+    stream = io.BytesIO()
+    savemat(stream, {"values": _MATRIX[:, 1:].T, "wavelength": WAVELENGTH}, do_compression=True)
+    return [stream.getvalue()]
 
 
 def _zarr_part(part: str) -> Target:
@@ -243,7 +244,7 @@ TARGETS: dict[str, Target] = {
     "filters-toml": Target("f.toml", read_filters, _toml_filters),
     "filters-csv": Target("f.csv", read_filters, _text(_CSV)),
     "filters-npz": Target("f.npz", read_filters, _npz_filters),
-    "filters-mat": Target("f.mat", read_filters, _mat),
+    "filters-mat": Target("f.mat", read_filters, _mat_filters),
     "material-csv": Target("f.csv", lambda p: refractive_index(p, 600.0), _text(_NK)),
     "material-yaml": Target("f.yml", lambda p: refractive_index(p, 600.0), _text(_YAML)),
     "sweep-csv": Target("sweep.csv", lambda p: list(read_sweep(p.parent)),
@@ -259,7 +260,3 @@ def prepare(target: Target, folder: Path) -> None:
     """Lay out what a target needs around its file."""
     if ".zarr/" in target.name:
         save(_cube(), folder / "f.zarr")
-
-
-def clear(folder: Path) -> None:
-    shutil.rmtree(folder, ignore_errors=True)

@@ -9,7 +9,7 @@ import xarray as xr
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.errors import InputError
-from squilla.files.disk import check_size, existing, reading, replacing
+from squilla.files.disk import check_size, existing, reading, write_netcdf
 
 _KIND = "squilla calibration"
 _FRAMES = ("bias", "dark_rate", "flat")
@@ -68,8 +68,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
             attributes[f"pixels_{name}"] = float(getattr(pixels, name))
     dataset = xr.Dataset(variables, attrs=attributes)
     dataset.attrs["checksum"] = _digest(dataset)
-    with replacing(path) as temporary:
-        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=dict.fromkeys(variables, checked))
+    write_netcdf(dataset, path, encoding=dict.fromkeys(variables, checked))
 
 
 def load_calibration(path: str | Path) -> Calibration:

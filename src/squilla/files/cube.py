@@ -13,7 +13,7 @@ from xarray import DataArray
 
 from squilla.errors import InputError
 from squilla.files.arrays import assemble, read_mat, read_npy, read_npz
-from squilla.files.disk import check_size, existing, reading, replacing
+from squilla.files.disk import check_size, existing, reading, replacing, write_netcdf
 from squilla.files.envi import DATA_SUFFIXES, read_envi, write_envi
 from squilla.files.lazy import DIMS
 from squilla.files.notebook import CubeAccessor
@@ -91,7 +91,7 @@ def save(
     if suffix in (".nc", ".zarr"):
         dataset = xr.Dataset(arrays)
         dataset.attrs = {"Conventions": "CF-1.11", "cube": next(iter(arrays))}
-        (_write_netcdf if suffix == ".nc" else _write_zarr)(dataset, path)
+        (write_netcdf if suffix == ".nc" else _write_zarr)(dataset, path)
         return
     first, *others = arrays
     for name in others:
@@ -366,11 +366,6 @@ def _beside(path: Path, cube: DataArray, one: Callable[[Path], DataArray]) -> di
             beside = beside.isel(wavelength=0)
         extra[str(beside.name)] = beside
     return extra
-
-
-def _write_netcdf(dataset: xr.Dataset, path: Path) -> None:
-    with replacing(path) as temporary:
-        dataset.to_netcdf(temporary, engine="h5netcdf")
 
 
 def need_zarr(path: Path) -> None:

@@ -5,9 +5,13 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from squilla.errors import InputError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _DENSEST = 2000
 """Bytes in memory that one byte on disk can stand for; deflate reaches 1030, on zeros alone."""
@@ -53,6 +57,16 @@ def replacing(path: str | Path, *, folder: bool = False) -> Iterator[Path]:
             shutil.rmtree(temporary)
         else:
             temporary.unlink(missing_ok=True)
+
+
+def write_netcdf(dataset: "xr.Dataset", path: str | Path, **how: Any) -> None:
+    """Write a NetCDF file, whole or not at all.
+
+    It is made in memory first: HDF5 takes the whole process with it when a disk is full.
+    """
+    content = dataset.to_netcdf(engine="h5netcdf", **how)
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def flush(path: Path) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from squilla.errors import InputError
-from squilla.files.disk import reading
+from squilla.files.disk import check_size, reading
 from squilla.optics.angle import blue_shift
 from squilla.optics.materials import read_columns
 from squilla.spectra import grid
@@ -127,7 +127,7 @@ def read_table(
         raise InputError(
             f"Filters cannot be read from {path.name}; expected .toml, {', '.join(_KINDS)}."
         )
-    with reading(path, "filter table"):
+    with reading(path, "table of filters"):
         values, own = read(path)
     wavelength = own if wavelength is None else np.asarray(wavelength, float)
     if wavelength is None:
@@ -162,9 +162,10 @@ def _matrix(variables: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _read_mat(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    from scipy.io import loadmat
+    from scipy.io import loadmat, whosmat
 
     try:
+        check_size(path, sum(int(np.prod(shape, dtype=float)) for _, shape, _ in whosmat(path)))
         variables = loadmat(path)
     except NotImplementedError:
         raise InputError(f"{path} is of MATLAB's version 7.3; save it with '-v7'.") from None
@@ -172,12 +173,13 @@ def _read_mat(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    with np.load(path) as table:
+    with np.load(path, allow_pickle=False) as table:
+        check_size(path, sum(entry.file_size for entry in table.zip.infolist()))
         return _matrix(dict(table))
 
 
 def _read_npy(path: Path) -> tuple[np.ndarray, None]:
-    return np.load(path).astype(float), None
+    return np.load(path, mmap_mode="r", allow_pickle=False).astype(float), None
 
 
 def _read_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
