@@ -8,6 +8,7 @@ pictures, of which each unit sees its own mixture (the pictures and mixtures are
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -109,14 +110,14 @@ def find_plane(
     -------
     Placement
     """
+    few = edges.thinned()
+    stages = [(few, 1), (edges, _RANK)]
     if start is None:
         coarse = edges.directions()
         plane = np.array([_search(coarse, lattice, first, span), 0.0, 0.0])
-        stages = [(coarse, 1), (edges, 1), (edges, _RANK)]
+        stages.insert(0, (coarse, 1))
     else:
-        plane, stages = np.array(start, float), [(edges, 1), (edges, _RANK)]
-    if free:  # several pictures would take for colour what is still misplaced
-        del stages[-1]
+        plane = np.array(start, float)
     offset = np.zeros(first.shape)
     for level, rank in stages:
         for _ in range(8):
@@ -195,12 +196,21 @@ def compare(
     into = values.swapaxes(0, 1)
     resample(edges.values, edges.bad, place, baseline, disparity, CUBIC, into, seen)
     values = values.reshape(units, 2 * points)
-    common, share, spread, score = _common(values, seen.reshape(units, points), rank)
+    _fill_in(values, seen.reshape(units, points))
+    upper, lower = _products(values)
+    gram, share, spread = _first(upper + lower, values.shape[1])
+    common = (share / spread[:, None]).T.astype(np.float32) @ values
+    slopes = _slopes(common, shape) / edges.step
+    moves = _moves(slopes, grid[:terms])
+    if rank > 1:
+        moved = (values @ moves.T) / spread[:, None]
+        more = _others(gram, moved, moves, share, rank, values.shape[1])
+        others = (more / spread[:, None]).T.astype(np.float32) @ values
+        slopes = np.concatenate([slopes, _slopes(others, shape) / edges.step])
+        moves = np.concatenate([moves, _moves(slopes[1:], grid[:terms])])
+        share, common = np.hstack([share, more]), np.concatenate([common, others])
+    score = (_agreement(upper, lower) + _agreement(lower, upper)) / 2
     rank = share.shape[1]
-    slopes = _slopes(common.reshape(2 * rank, *shape)).reshape(rank, 2, 2, points) / edges.step
-    slopes = slopes.swapaxes(1, 2)  # (rank, axis, part, points)
-    moves = slopes[:, :, None] * grid[:terms, None].reshape(terms, 1, points).astype(np.float32)
-    moves = moves.reshape(rank * 2 * terms, 2 * points)
     misfit = (values @ moves.T) / spread[:, None] - share @ (common @ moves.T)
     gram = (moves @ moves.T).reshape(rank, 2 * terms, rank, 2 * terms).astype(float)
     free = np.eye(units) - share @ share.T
@@ -215,49 +225,82 @@ def compare(
     )
 
 
-def _common(values: np.ndarray, seen: np.ndarray, rank: int) -> tuple:
-    """Return what units have in common: edges of all, and the share of each unit in them.
+def _fill_in(values: np.ndarray, seen: np.ndarray) -> None:
+    """Fill in what units do not see, (M, P), by the mean of the others: (M, 2 P), real first."""
+    if seen.all():
+        return
+    parts = values.reshape(len(values), 2, -1)
+    parts *= seen[:, None]
+    mean = parts.sum(0) / (seen.sum(0) + 1e-9)
+    share = np.einsum("mcp,cp->m", parts, mean) / (seen @ np.square(mean).sum(0) + 1e-9)
+    parts += np.where(seen[:, None], 0, share[:, None, None] * mean).astype(np.float32)
+
+
+def _products(values: np.ndarray) -> list[np.ndarray]:
+    """Return the units' inner products over each half of the field, two of (M, M)."""
+    parts = values.reshape(len(values), 2, -1)
+    middle = parts.shape[2] // 2
+    halves = [
+        (half[:, 0] @ half[:, 0].T + half[:, 1] @ half[:, 1].T).astype(float)
+        for half in (parts[..., :middle], parts[..., middle:])
+    ]
+    return halves
+
+
+def _first(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what is most alike in all units.
 
     Parameters
     ----------
-    values : array, (M, 2 P)
-        Real parts, then imaginary parts; what is not seen is filled in from the others.
-    seen : array, (M, P) bool
-    rank : int
-        Most pictures that the units' edges are taken to be mixed from.
+    products : array, (M, M)
+        Inner products of the units' values.
+    count : int
+        Number of values.
 
     Returns
     -------
-    common : array, (rank, 2 P)
-    share : array, (M, rank), orthonormal: values / spread is about share @ common.
+    products : array, (M, M), of values in units of their noise.
+    share : array, (M, 1), of unit length: values / spread is about share @ common.
     spread : array, (M,), standard deviation of each unit's noise.
-    score : float
     """
-    points = values.shape[1] // 2
-    if not seen.all():
-        parts = values.reshape(len(values), 2, points)
-        parts *= seen[:, None]
-        mean = parts.sum(0) / (seen.sum(0) + 1e-9)
-        share = np.einsum("mcp,cp->m", parts, mean) / (seen @ np.square(mean).sum(0) + 1e-9)
-        parts += np.where(seen[:, None], 0, share[:, None, None] * mean).astype(np.float32)
-    middle = points // 2
+    strength, vectors = np.linalg.eigh(products)
+    alone = np.diag(products) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
+    spread = np.sqrt(np.maximum(alone / count, 1e-5))
+    products = products / np.outer(spread, spread)
+    return products, np.linalg.eigh(products)[1][:, -1:], spread
 
-    def products(start: int, stop: int) -> np.ndarray:
-        """Return the units' inner products over some points, (M, M)."""
-        real, imaginary = values[:, start:stop], values[:, points + start : points + stop]
-        return (real @ real.T + imaginary @ imaginary.T).astype(float)
 
-    upper, lower = products(0, middle), products(middle, points)
-    strength, vectors = np.linalg.eigh(upper + lower)
-    alone = np.diag(upper + lower) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
-    spread = np.sqrt(np.maximum(alone / values.shape[1], 1e-5))
-    strength, vectors = np.linalg.eigh((upper + lower) / np.outer(spread, spread))
-    clear = int(np.sum(strength > _FAINT * values.shape[1]))
-    rank = max(1, min(rank, len(values) // 6, clear))
-    share = vectors[:, : -1 - rank : -1]
-    common = (share / spread[:, None]).T.astype(np.float32) @ values
-    score = (_agreement(upper, lower) + _agreement(lower, upper)) / 2
-    return common, share, spread, score
+def _others(
+    products: np.ndarray, moved: np.ndarray, moves: np.ndarray, first: np.ndarray, rank: int,
+    count: int,
+) -> np.ndarray:  # fmt: skip
+    """Return the shares of the units in further pictures, (M, rank - 1) or fewer, orthonormal.
+
+    A unit that lies off shows the first picture and some of its slopes, and so another picture than
+    the rest: whatever those slopes explain tells nothing of mixtures and is left out.
+
+    Parameters
+    ----------
+    products : array, (M, M)
+        Of the units' values, in units of their noise.
+    moved : array, (M, S)
+        Their products with `moves`.
+    moves : array, (S, 2 P)
+        How the first picture changes when it moves.
+    first : array, (M, 1)
+        Shares in the first picture.
+    rank : int
+        Most pictures.
+    count : int
+        Number of values of each unit.
+    """
+    own = (moves @ moves.T).astype(float)
+    own += 1e-6 * np.trace(own) / len(own) * np.eye(len(own))
+    rest = np.eye(len(first)) - first @ first.T
+    left = rest @ (products - moved @ np.linalg.solve(own, moved.T)) @ rest
+    strength, vectors = np.linalg.eigh(left)
+    clear = int(np.sum(strength > _FAINT * count))
+    return vectors[:, ::-1][:, : min(rank, len(first) // 6, clear + 1) - 1]
 
 
 def _agreement(one: np.ndarray, other: np.ndarray) -> float:
@@ -290,6 +333,7 @@ def _relief(values, common, share, spread, free, slopes, baseline, shape) -> np.
     return np.stack([sums[0], sums[1] + 1e-6]).reshape(2, _PARTS, _PARTS)
 
 
+@cache
 def _grid(field: tuple[int, int], step: int) -> tuple:
     """Return the shape, monomials, first pixel and scale of every `step`-th point of a field.
 
@@ -303,18 +347,23 @@ def _grid(field: tuple[int, int], step: int) -> tuple:
     return shape, monomials(*shape) * scale[:, None, None], corner, scale
 
 
-def _slopes(picture: np.ndarray) -> np.ndarray:
-    """Return derivatives along y and x, (2, h, w) -> (2, 2, h, w), zero at the border."""
-    slopes = np.zeros((2, *picture.shape), np.float32)
+def _slopes(pictures: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return derivatives of pictures, (R, 2 P), along y and x, (R, 2, 2 P), zero at the border."""
+    pictures = pictures.reshape(-1, *shape)
+    slopes = np.zeros((2, *pictures.shape), np.float32)
     inner = slice(2, -2)
     for axis in (1, 2):
-        p = np.moveaxis(picture, axis, -1)
+        p = np.moveaxis(pictures, axis, -1)
         rise = (8 * (p[..., 3:-1] - p[..., 1:-3]) - (p[..., 4:] - p[..., :-4])) / 12
         np.moveaxis(slopes[axis - 1], axis, -1)[..., inner] = rise
-    border = np.ones(picture.shape[1:], bool)
-    border[inner, inner] = False
-    slopes[..., border] = 0
-    return slopes.swapaxes(0, 1)
+    slopes[..., :2, :], slopes[..., -2:, :], slopes[..., :2], slopes[..., -2:] = 0, 0, 0, 0
+    return np.moveaxis(slopes.reshape(2, len(pictures) // 2, 2 * shape[0] * shape[1]), 0, 1)
+
+
+def _moves(slopes: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return how pictures change by polynomial moves along y and x, (R 2 K, 2 P)."""
+    terms = np.tile(grid.reshape(len(grid), -1), 2).astype(np.float32)
+    return (slopes[:, :, None] * terms).reshape(-1, slopes.shape[-1])
 
 
 def _solve(evidence: Evidence, lattice: Lattice, plane, offset, free: float):
