@@ -46,6 +46,8 @@ class Evidence:
 
     pull : (M, 2 K) slope of the log likelihood, 1/px.
     precision : (M, 2 K, M, 2 K) its curvature, 1/px^2; zero for a shift of all units together.
+    single : (4, M, 2, 3) in each quarter of the field, pull (first) and precision of each unit's
+        shift alone.
     relief : (2, B, B) pull and precision, 1/(px per pitch), of the disparity of each of B x B
         parts of the field alone.
     score : mean correlation of each unit's edges with those of the others; 0 for noise.
@@ -53,6 +55,7 @@ class Evidence:
 
     pull: np.ndarray
     precision: np.ndarray
+    single: np.ndarray
     relief: np.ndarray
     score: float
 
@@ -65,8 +68,9 @@ class Placement:
         there to the last row's and the last column's middle.
     covariance : (3, 3) of `plane`, by the noise of the edges, were the units' places known.
     offset : (M, 2) px, by which each unit lies beside its place in the lattice.
-    leftover : (M, 2) px, by which single units would still move if each were free.
-    uncertainty : (M, 2) px, standard deviation of `leftover` by the noise.
+    leftover : (4, M, 2) px, by which each unit would still move by each quarter of the field, were
+        it free.
+    uncertainty : (4, M, 2) px, standard deviation of `leftover` by the noise.
     relief : (B, B) px per pitch, by which parts of the field lie beside the plane.
     flatness : (B, B) px per pitch, standard deviation of `relief` by the noise.
     score : mean correlation of each unit's edges with those of the others; 0 for noise.
@@ -110,8 +114,8 @@ def find_plane(
     -------
     Placement
     """
-    few = edges.thinned()
-    stages = [(few, 1), (edges, _RANK)]
+    # Were single units free, several pictures would take for colour what is still misplaced.
+    stages = [(edges.thinned(), 1), (edges, 1 if free else _RANK)]
     if start is None:
         coarse = edges.directions()
         plane = np.array([_search(coarse, lattice, first, span), 0.0, 0.0])
@@ -129,21 +133,13 @@ def find_plane(
             if change < _NEAR:
                 break
     pull, precision = found.relief
-    leftover, uncertainty = _single(found)
+    own = found.single[..., 1:] + 1e-3 * np.eye(2)
+    leftover = np.linalg.solve(own, found.single[..., :1])[..., 0]
+    uncertainty = np.sqrt(np.einsum("qmaa->qma", np.linalg.inv(own)))
     return Placement(
         plane, covariance, offset, leftover, uncertainty,
         pull / precision, precision**-0.5, found.score,
     )  # fmt: skip
-
-
-def _single(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much each unit alone would still move, and by the noise, (M, 2) px."""
-    units, terms = len(evidence.pull), evidence.pull.shape[1] // 2
-    own = np.array([0, terms])
-    precision = evidence.precision[np.arange(units), :, np.arange(units)][:, own[:, None], own]
-    covariance = np.linalg.inv(precision + 1e-6 * np.eye(2))
-    shift = np.einsum("mab,mb->ma", covariance, evidence.pull[:, own])
-    return shift, np.sqrt(np.einsum("maa->ma", covariance))
 
 
 def fit_plane(disparity: np.ndarray) -> np.ndarray:
@@ -198,30 +194,28 @@ def compare(
     values = values.reshape(units, 2 * points)
     _fill_in(values, seen.reshape(units, points))
     upper, lower = _products(values)
-    gram, share, spread = _first(upper + lower, values.shape[1])
+    products, share, spread = _mixtures(upper + lower, 2 * points, rank)
+    rank = share.shape[1]
     common = (share / spread[:, None]).T.astype(np.float32) @ values
     slopes = _slopes(common, shape) / edges.step
     moves = _moves(slopes, grid[:terms])
-    if rank > 1:
-        moved = (values @ moves.T) / spread[:, None]
-        more = _others(gram, moved, moves, share, rank, values.shape[1])
-        others = (more / spread[:, None]).T.astype(np.float32) @ values
-        slopes = np.concatenate([slopes, _slopes(others, shape) / edges.step])
-        moves = np.concatenate([moves, _moves(slopes[1:], grid[:terms])])
-        share, common = np.hstack([share, more]), np.concatenate([common, others])
-    score = (_agreement(upper, lower) + _agreement(lower, upper)) / 2
-    rank = share.shape[1]
-    misfit = (values @ moves.T) / spread[:, None] - share @ (common @ moves.T)
-    gram = (moves @ moves.T).reshape(rank, 2 * terms, rank, 2 * terms).astype(float)
+    moved, own = (values @ moves.T) / spread[:, None], (moves @ moves.T).astype(float)
+    misfit = moved - share @ (common @ moves.T)
+    gram = own.reshape(rank, 2 * terms, rank, 2 * terms)
     free = np.eye(units) - share @ share.T
     half = np.einsum("ir,rasb->iasb", share, gram)
     precision = np.einsum("ij,iasb,js->iajb", free, half, share, optimize=True)
+    first_alone = slice(2 * terms)
+    others = _unmoved(
+        products, moved[:, first_alone], own[first_alone, first_alone], share[:, :1], 2 * points
+    )
     return Evidence(
         -np.einsum("mr,mra->ma", share, misfit.reshape(units, rank, -1)) / edges.shared,
         precision / edges.shared,
+        _single(values / spread[:, None], others, share[:, 0], slopes[0], shape) / edges.shared,
         _relief(values, common, share, spread, free, slopes, lattice.baseline, shape)
         / edges.shared,
-        score,
+        (_agreement(upper, lower) + _agreement(lower, upper)) / 2,
     )
 
 
@@ -247,60 +241,95 @@ def _products(values: np.ndarray) -> list[np.ndarray]:
     return halves
 
 
-def _first(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what is most alike in all units.
+def _mixtures(
+    products: np.ndarray, count: int, rank: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return how units mix the few pictures that explain most.
 
     Parameters
     ----------
     products : array, (M, M)
         Inner products of the units' values.
     count : int
-        Number of values.
+        Number of values of each unit.
+    rank : int
+        Most pictures that the units' edges are taken to be mixed from.
 
     Returns
     -------
     products : array, (M, M), of values in units of their noise.
-    share : array, (M, 1), of unit length: values / spread is about share @ common.
+    share : array, (M, rank), orthonormal: values / spread is about share @ common.
     spread : array, (M,), standard deviation of each unit's noise.
     """
     strength, vectors = np.linalg.eigh(products)
     alone = np.diag(products) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
     spread = np.sqrt(np.maximum(alone / count, 1e-5))
     products = products / np.outer(spread, spread)
-    return products, np.linalg.eigh(products)[1][:, -1:], spread
+    strength, vectors = np.linalg.eigh(products)
+    clear = int(np.sum(strength > _FAINT * count))
+    rank = max(1, min(rank, len(products) // 6, clear))
+    return products, vectors[:, : -1 - rank : -1], spread
 
 
-def _others(
-    products: np.ndarray, moved: np.ndarray, moves: np.ndarray, first: np.ndarray, rank: int,
-    count: int,
-) -> np.ndarray:  # fmt: skip
-    """Return the shares of the units in further pictures, (M, rank - 1) or fewer, orthonormal.
+def _unmoved(
+    products: np.ndarray, moved: np.ndarray, own: np.ndarray, first: np.ndarray, count: int
+) -> np.ndarray:
+    """Return the shares in the first picture and in others that no shift has made, (M, R).
 
-    A unit that lies off shows the first picture and some of its slopes, and so another picture than
-    the rest: whatever those slopes explain tells nothing of mixtures and is left out.
+    A unit that lies off shows the first picture and some of its slopes, as if that were another
+    colour. Where it is asked whether single units lie off, whatever those slopes explain must
+    therefore tell nothing of the other pictures.
 
     Parameters
     ----------
     products : array, (M, M)
         Of the units' values, in units of their noise.
     moved : array, (M, S)
-        Their products with `moves`.
-    moves : array, (S, 2 P)
-        How the first picture changes when it moves.
+        Their products with the changes of the first picture when it moves.
+    own : array, (S, S)
+        Products of those changes.
     first : array, (M, 1)
         Shares in the first picture.
-    rank : int
-        Most pictures.
     count : int
         Number of values of each unit.
     """
-    own = (moves @ moves.T).astype(float)
-    own += 1e-6 * np.trace(own) / len(own) * np.eye(len(own))
+    own = own + 1e-6 * np.trace(own) / len(own) * np.eye(len(own))
     rest = np.eye(len(first)) - first @ first.T
     left = rest @ (products - moved @ np.linalg.solve(own, moved.T)) @ rest
     strength, vectors = np.linalg.eigh(left)
     clear = int(np.sum(strength > _FAINT * count))
-    return vectors[:, ::-1][:, : min(rank, len(first) // 6, clear + 1) - 1]
+    return np.hstack([first, vectors[:, ::-1][:, : min(_RANK, len(first) // 6, clear + 1) - 1]])
+
+
+def _single(
+    values: np.ndarray, share: np.ndarray, first: np.ndarray, slopes: np.ndarray, shape
+) -> np.ndarray:
+    """Return pull and precision of each unit alone in each quarter of the field, (4, M, 2, 3).
+
+    Parameters
+    ----------
+    values : array, (M, 2 P)
+        In units of their noise.
+    share : array, (M, R), orthonormal
+        Of the units in the pictures that are taken to be mixed.
+    first : array, (M,)
+        In the one by whose slopes shifts are seen.
+    slopes : array, (2, 2 P)
+        Of that one along y and x.
+    shape : (int, int)
+    """
+    values, slopes = values.reshape(-1, 2, *shape), slopes.reshape(2, 2, *shape)
+    halves = [(slice(0, size // 2), slice(size // 2, size)) for size in shape]
+    free = np.eye(len(first)) - share @ share.T
+    quarters = []
+    for rows in halves[0]:
+        for columns in halves[1]:
+            some, rise = values[..., rows, columns], slopes[..., rows, columns]
+            rise = rise.reshape(2, -1)
+            pull = -first[:, None] * (free @ (some.reshape(len(first), -1) @ rise.T))
+            precision = (first**2 * np.diag(free))[:, None, None] * (rise @ rise.T)
+            quarters.append(np.concatenate([pull[..., None], precision], -1))
+    return np.array(quarters)
 
 
 def _agreement(one: np.ndarray, other: np.ndarray) -> float:
