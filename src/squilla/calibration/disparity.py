@@ -46,18 +46,38 @@ class Evidence:
 
     pull : (M, 2 K) slope of the log likelihood, 1/px.
     precision : (M, 2 K, M, 2 K) its curvature, 1/px^2; zero for a shift of all units together.
-    single : (4, M, 2, 3) in each quarter of the field, pull (first) and precision of each unit's
-        shift alone.
-    relief : (2, B, B) pull and precision, 1/(px per pitch), of the disparity of each of B x B
-        parts of the field alone.
-    score : mean correlation of each unit's edges with those of the others; 0 for noise.
+    aligned : what it was told by.
     """
 
     pull: np.ndarray
     precision: np.ndarray
-    single: np.ndarray
-    relief: np.ndarray
-    score: float
+    aligned: "Aligned"
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Edges of all units, aligned by a guess, and the pictures they are mixed from.
+
+    values : (M, 2 P) in units of the noise; along x, then along y.
+    halves : two of (M, M), inner products of the units over each half of the field, not scaled.
+    share : (M, R), orthonormal: values are about share @ common.
+    common : (R, 2 P) pictures.
+    slopes : (R, 2, 2 P) of the pictures along y and x, 1/px.
+    moved : (M, 2 K), products of values with how the first picture changes when it moves.
+    moves : (2 K, 2 K), products of those changes.
+    shape : (h, w) of a picture.
+    shared : number of points that share their noise.
+    """
+
+    values: np.ndarray
+    halves: list[np.ndarray]
+    share: np.ndarray
+    common: np.ndarray
+    slopes: np.ndarray
+    moved: np.ndarray
+    moves: np.ndarray
+    shape: tuple[int, int]
+    shared: float
 
 
 @dataclass(frozen=True)
@@ -115,13 +135,13 @@ def find_plane(
     Placement
     """
     # Were single units free, several pictures would take for colour what is still misplaced.
-    stages = [(edges.thinned(), 1), (edges, 1 if free else _RANK)]
+    stages = [(edges, 1 if free else _RANK)]
     if start is None:
         coarse = edges.directions()
         plane = np.array([_search(coarse, lattice, first, span), 0.0, 0.0])
-        stages.insert(0, (coarse, 1))
+        stages = [(coarse, 1), (edges.thinned(), 1), *stages]
     else:
-        plane = np.array(start, float)
+        plane, stages = np.array(start, float), [(edges, 1), *stages]
     offset = np.zeros(first.shape)
     for level, rank in stages:
         for _ in range(8):
@@ -132,13 +152,10 @@ def find_plane(
             change = max(np.abs(step).max() * _reach(lattice), np.abs(moved).max())
             if change < _NEAR:
                 break
-    pull, precision = found.relief
-    own = found.single[..., 1:] + 1e-3 * np.eye(2)
-    leftover = np.linalg.solve(own, found.single[..., :1])[..., 0]
-    uncertainty = np.sqrt(np.einsum("qmaa->qma", np.linalg.inv(own)))
+    pull, precision = _relief(found.aligned, lattice.baseline)
     return Placement(
-        plane, covariance, offset, leftover, uncertainty,
-        pull / precision, precision**-0.5, found.score,
+        plane, covariance, offset, *_single(found.aligned),
+        pull / precision, precision**-0.5, _score(found.aligned),
     )  # fmt: skip
 
 
@@ -193,30 +210,25 @@ def compare(
     resample(edges.values, edges.bad, place, baseline, disparity, CUBIC, into, seen)
     values = values.reshape(units, 2 * points)
     _fill_in(values, seen.reshape(units, points))
-    upper, lower = _products(values)
-    products, share, spread = _mixtures(upper + lower, 2 * points, rank)
+    halves = _products(values)
+    share, spread = _mixtures(halves[0] + halves[1], 2 * points, rank)
     rank = share.shape[1]
-    common = (share / spread[:, None]).T.astype(np.float32) @ values
+    values /= spread[:, None].astype(np.float32)
+    common = share.T.astype(np.float32) @ values
     slopes = _slopes(common, shape) / edges.step
     moves = _moves(slopes, grid[:terms])
-    moved, own = (values @ moves.T) / spread[:, None], (moves @ moves.T).astype(float)
+    moved, gram = values @ moves.T, (moves @ moves.T).astype(float)
     misfit = moved - share @ (common @ moves.T)
-    gram = own.reshape(rank, 2 * terms, rank, 2 * terms)
+    pull = -np.einsum("mr,mra->ma", share, misfit.reshape(units, rank, -1))
     free = np.eye(units) - share @ share.T
-    half = np.einsum("ir,rasb->iasb", share, gram)
+    half = np.einsum("ir,rasb->iasb", share, gram.reshape(rank, 2 * terms, rank, 2 * terms))
     precision = np.einsum("ij,iasb,js->iajb", free, half, share, optimize=True)
     first_alone = slice(2 * terms)
-    others = _unmoved(
-        products, moved[:, first_alone], own[first_alone, first_alone], share[:, :1], 2 * points
-    )
-    return Evidence(
-        -np.einsum("mr,mra->ma", share, misfit.reshape(units, rank, -1)) / edges.shared,
-        precision / edges.shared,
-        _single(values / spread[:, None], others, share[:, 0], slopes[0], shape) / edges.shared,
-        _relief(values, common, share, spread, free, slopes, lattice.baseline, shape)
-        / edges.shared,
-        (_agreement(upper, lower) + _agreement(lower, upper)) / 2,
-    )
+    aligned = Aligned(
+        values, halves, share, common, slopes, moved[:, first_alone],
+        gram[first_alone, first_alone], shape, edges.shared,
+    )  # fmt: skip
+    return Evidence(pull / edges.shared, precision / edges.shared, aligned)
 
 
 def _fill_in(values: np.ndarray, seen: np.ndarray) -> None:
@@ -241,9 +253,7 @@ def _products(values: np.ndarray) -> list[np.ndarray]:
     return halves
 
 
-def _mixtures(
-    products: np.ndarray, count: int, rank: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _mixtures(products: np.ndarray, count: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
     """Return how units mix the few pictures that explain most.
 
     Parameters
@@ -257,79 +267,66 @@ def _mixtures(
 
     Returns
     -------
-    products : array, (M, M), of values in units of their noise.
-    share : array, (M, rank), orthonormal: values / spread is about share @ common.
+    share : array, (M, rank), orthonormal: values / spread is about share @ pictures.
     spread : array, (M,), standard deviation of each unit's noise.
     """
     strength, vectors = np.linalg.eigh(products)
     alone = np.diag(products) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
     spread = np.sqrt(np.maximum(alone / count, 1e-5))
-    products = products / np.outer(spread, spread)
-    strength, vectors = np.linalg.eigh(products)
+    strength, vectors = np.linalg.eigh(products / np.outer(spread, spread))
     clear = int(np.sum(strength > _FAINT * count))
     rank = max(1, min(rank, len(products) // 6, clear))
-    return products, vectors[:, : -1 - rank : -1], spread
+    return vectors[:, : -1 - rank : -1], spread
 
 
-def _unmoved(
-    products: np.ndarray, moved: np.ndarray, own: np.ndarray, first: np.ndarray, count: int
-) -> np.ndarray:
+def _unmoved(aligned: Aligned) -> np.ndarray:
     """Return the shares in the first picture and in others that no shift has made, (M, R).
 
     A unit that lies off shows the first picture and some of its slopes, as if that were another
     colour. Where it is asked whether single units lie off, whatever those slopes explain must
     therefore tell nothing of the other pictures.
-
-    Parameters
-    ----------
-    products : array, (M, M)
-        Of the units' values, in units of their noise.
-    moved : array, (M, S)
-        Their products with the changes of the first picture when it moves.
-    own : array, (S, S)
-        Products of those changes.
-    first : array, (M, 1)
-        Shares in the first picture.
-    count : int
-        Number of values of each unit.
     """
-    own = own + 1e-6 * np.trace(own) / len(own) * np.eye(len(own))
+    first, moves = aligned.share[:, :1], aligned.moves
+    moves = moves + 1e-6 * np.trace(moves) / len(moves) * np.eye(len(moves))
+    products = (aligned.values @ aligned.values.T).astype(float)
     rest = np.eye(len(first)) - first @ first.T
-    left = rest @ (products - moved @ np.linalg.solve(own, moved.T)) @ rest
-    strength, vectors = np.linalg.eigh(left)
-    clear = int(np.sum(strength > _FAINT * count))
+    left = products - aligned.moved @ np.linalg.solve(moves, aligned.moved.T)
+    strength, vectors = np.linalg.eigh(rest @ left @ rest)
+    clear = int(np.sum(strength > _FAINT * aligned.values.shape[1]))
     return np.hstack([first, vectors[:, ::-1][:, : min(_RANK, len(first) // 6, clear + 1) - 1]])
 
 
-def _single(
-    values: np.ndarray, share: np.ndarray, first: np.ndarray, slopes: np.ndarray, shape
-) -> np.ndarray:
-    """Return pull and precision of each unit alone in each quarter of the field, (4, M, 2, 3).
+def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much each unit alone would still move in each quarter of the field.
 
-    Parameters
-    ----------
-    values : array, (M, 2 P)
-        In units of their noise.
-    share : array, (M, R), orthonormal
-        Of the units in the pictures that are taken to be mixed.
-    first : array, (M,)
-        In the one by whose slopes shifts are seen.
-    slopes : array, (2, 2 P)
-        Of that one along y and x.
-    shape : (int, int)
+    Returns
+    -------
+    shift : array, (4, M, 2), px
+    uncertainty : array, (4, M, 2), px
+        Standard deviation by the noise.
     """
-    values, slopes = values.reshape(-1, 2, *shape), slopes.reshape(2, 2, *shape)
-    halves = [(slice(0, size // 2), slice(size // 2, size)) for size in shape]
+    share, first = _unmoved(aligned), aligned.share[:, 0]
+    values = aligned.values.reshape(-1, 2, *aligned.shape)
+    slopes = aligned.slopes[0].reshape(2, 2, *aligned.shape)
+    rows, columns = (
+        (slice(0, size // 2), slice(size // 2, size)) for size in aligned.shape
+    )
     free = np.eye(len(first)) - share @ share.T
-    quarters = []
-    for rows in halves[0]:
-        for columns in halves[1]:
-            some, rise = values[..., rows, columns], slopes[..., rows, columns]
-            rise = rise.reshape(2, -1)
-            pull = -first[:, None] * (free @ (some.reshape(len(first), -1) @ rise.T))
-            precision = (first**2 * np.diag(free))[:, None, None] * (rise @ rise.T)
-            quarters.append(np.concatenate([pull[..., None], precision], -1))
-    return np.array(quarters)
+    shifts, doubts = [], []
+    for quarter in [(..., row, column) for row in rows for column in columns]:
+        rise = slopes[quarter].reshape(2, -1)
+        pull = -first[:, None] * (free @ (values[quarter].reshape(len(first), -1) @ rise.T))
+        precision = (first**2 * np.diag(free))[:, None, None] * (rise @ rise.T)
+        covariance = np.linalg.inv(precision / aligned.shared + 1e-3 * np.eye(2))
+        shifts.append(np.einsum("mab,mb->ma", covariance, pull / aligned.shared))
+        doubts.append(np.sqrt(np.einsum("maa->ma", covariance)))
+    return np.array(shifts), np.array(doubts)
+
+
+def _score(aligned: Aligned) -> float:
+    """Return the mean correlation of each unit's edges with those of the others; 0 for noise."""
+    upper, lower = aligned.halves
+    return (_agreement(upper, lower) + _agreement(lower, upper)) / 2
 
 
 def _agreement(one: np.ndarray, other: np.ndarray) -> float:
@@ -345,13 +342,15 @@ def _agreement(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.mean(np.sign(share) * alike))  # some units may show the negative
 
 
-def _relief(values, common, share, spread, free, slopes, baseline, shape) -> np.ndarray:
+def _relief(aligned: Aligned, baseline: np.ndarray) -> np.ndarray:
     """Return pull and precision of the disparity in each part of the field, (2, B, B)."""
+    share, shape = aligned.share, aligned.shape
     rank, points = share.shape[1], shape[0] * shape[1]
     along = (baseline.T[None] * share.T[:, None]).reshape(2 * rank, -1)  # (rank axis, M)
-    slopes = slopes.reshape(2 * rank, -1)
-    misfit = (along / spread).astype(np.float32) @ values
-    misfit -= (along @ share).astype(np.float32) @ common
+    slopes = aligned.slopes.reshape(2 * rank, -1)
+    misfit = along.astype(np.float32) @ aligned.values
+    misfit -= (along @ share).astype(np.float32) @ aligned.common
+    free = np.eye(len(share)) - share @ share.T
     pull = -(misfit * slopes).sum(0)
     precision = ((along @ free @ along.T).astype(np.float32) @ slopes * slopes).sum(0)
     rows, columns = (np.arange(size) * _PARTS // size for size in shape)
@@ -359,7 +358,7 @@ def _relief(values, common, share, spread, free, slopes, baseline, shape) -> np.
     sums = [
         np.bincount(part, each.reshape(2, points).sum(0), _PARTS**2) for each in (pull, precision)
     ]
-    return np.stack([sums[0], sums[1] + 1e-6]).reshape(2, _PARTS, _PARTS)
+    return np.stack([sums[0], sums[1] + 1e-6]).reshape(2, _PARTS, _PARTS) / aligned.shared
 
 
 @cache
