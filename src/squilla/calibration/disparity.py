@@ -246,11 +246,10 @@ def _products(values: np.ndarray) -> list[np.ndarray]:
     """Return the units' inner products over each half of the field, two of (M, M)."""
     parts = values.reshape(len(values), 2, -1)
     middle = parts.shape[2] // 2
-    halves = [
+    return [
         (half[:, 0] @ half[:, 0].T + half[:, 1] @ half[:, 1].T).astype(float)
         for half in (parts[..., :middle], parts[..., middle:])
     ]
-    return halves
 
 
 def _mixtures(products: np.ndarray, count: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
@@ -279,7 +278,7 @@ def _mixtures(products: np.ndarray, count: int, rank: int) -> tuple[np.ndarray, 
     return vectors[:, : -1 - rank : -1], spread
 
 
-def _unmoved(aligned: Aligned) -> np.ndarray:
+def _unmoved(aligned: Aligned, products: np.ndarray) -> np.ndarray:
     """Return the shares in the first picture and in others that no shift has made, (M, R).
 
     A unit that lies off shows the first picture and some of its slopes, as if that were another
@@ -288,11 +287,12 @@ def _unmoved(aligned: Aligned) -> np.ndarray:
     """
     first, moves = aligned.share[:, :1], aligned.moves
     moves = moves + 1e-6 * np.trace(moves) / len(moves) * np.eye(len(moves))
-    products = (aligned.values @ aligned.values.T).astype(float)
     rest = np.eye(len(first)) - first @ first.T
-    left = products - aligned.moved @ np.linalg.solve(moves, aligned.moved.T)
-    strength, vectors = np.linalg.eigh(rest @ left @ rest)
-    clear = int(np.sum(strength > _FAINT * aligned.values.shape[1]))
+    shifts = rest @ aligned.moved @ np.linalg.solve(moves, aligned.moved.T) @ rest
+    strength, vectors = np.linalg.eigh(rest @ products @ rest - shifts)
+    # Slopes are differences, and do not explain all that a shift has made.
+    least = max(_FAINT * aligned.values.shape[1], 0.1 * np.linalg.eigvalsh(shifts)[-1])
+    clear = int(np.sum(strength > least))
     return np.hstack([first, vectors[:, ::-1][:, : min(_RANK, len(first) // 6, clear + 1) - 1]])
 
 
@@ -305,20 +305,21 @@ def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
     uncertainty : array, (4, M, 2), px
         Standard deviation by the noise.
     """
-    share, first = _unmoved(aligned), aligned.share[:, 0]
+    products = (aligned.values @ aligned.values.T).astype(float)
+    share, first = _unmoved(aligned, products), aligned.share[:, 0]
     values = aligned.values.reshape(-1, 2, *aligned.shape)
     slopes = aligned.slopes[0].reshape(2, 2, *aligned.shape)
-    rows, columns = (
-        (slice(0, size // 2), slice(size // 2, size)) for size in aligned.shape
-    )
+    rows, columns = ((slice(0, size // 2), slice(size // 2, size)) for size in aligned.shape)
     free = np.eye(len(first)) - share @ share.T
+    left = np.diag(free @ products @ free) / np.diag(free) / aligned.values.shape[1]
+    scale = 1 / (aligned.shared * np.maximum(left, 1e-6))[:, None]  # other colours are no noise
     shifts, doubts = [], []
     for quarter in [(..., row, column) for row in rows for column in columns]:
         rise = slopes[quarter].reshape(2, -1)
         pull = -first[:, None] * (free @ (values[quarter].reshape(len(first), -1) @ rise.T))
         precision = (first**2 * np.diag(free))[:, None, None] * (rise @ rise.T)
-        covariance = np.linalg.inv(precision / aligned.shared + 1e-3 * np.eye(2))
-        shifts.append(np.einsum("mab,mb->ma", covariance, pull / aligned.shared))
+        covariance = np.linalg.inv(precision * scale[..., None] + 1e-3 * np.eye(2))
+        shifts.append(np.einsum("mab,mb->ma", covariance, pull * scale))
         doubts.append(np.sqrt(np.einsum("maa->ma", covariance)))
     return np.array(shifts), np.array(doubts)
 
