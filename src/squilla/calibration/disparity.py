@@ -293,7 +293,8 @@ def _unmoved(aligned: Aligned, products: np.ndarray) -> np.ndarray:
     # Slopes are differences, and do not explain all that a shift has made.
     least = max(_FAINT * aligned.values.shape[1], 0.1 * np.linalg.eigvalsh(shifts)[-1])
     clear = int(np.sum(strength > least))
-    return np.hstack([first, vectors[:, ::-1][:, : min(_RANK, len(first) // 6, clear + 1) - 1]])
+    more = max(0, min(_RANK, len(first) // 6, clear + 1) - 1)
+    return np.hstack([first, vectors[:, ::-1][:, :more]])
 
 
 def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
