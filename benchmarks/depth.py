@@ -28,6 +28,7 @@ from scipy import ndimage
 
 import squilla
 from squilla.calibration import depth as dense
+from squilla.calibration import surfaces
 from squilla.calibration.alignment import align, measure, place
 from squilla.calibration.calibration import Calibration
 from squilla.calibration.rehearsal import Rehearsal
@@ -273,7 +274,7 @@ def compared(take: Take, snr: float) -> dict:
         start = time.process_time()
         found = method(take, views, noise)
         seconds = time.process_time() - start
-        seen = None if method is one_shift else dense._seen(found, baseline)
+        seen = None if method is one_shift else surfaces.unhidden(found, baseline)
         error = take.cube_error(found, seen)
         rows[name] = judged(take, found) | {"cube_error": error, "seconds": seconds}
     every_point(take, views, noise)
@@ -289,7 +290,7 @@ def compared(take: Take, snr: float) -> dict:
         ),
         "seen_by_fewer_than_half": int((seen.mean(-1) < 0.5).sum()),
     }
-    seen = dense._seen(take.truth.astype(np.float32), baseline)
+    seen = surfaces.unhidden(take.truth.astype(np.float32), baseline)
     rows["the truth"] = judged(take, take.truth) | {"cube_error": take.cube_error(take.truth, seen)}
     return rows
 

@@ -84,6 +84,7 @@ def capture(lattice: Lattice, plane, *, noise=0.0, colours=2, seed=0) -> SubImag
     """Return the windows of an array before a plane, each unit mixing a few pictures its way."""
     random = np.random.default_rng(seed)
     mixture = random.normal(0.3, 0.4, (len(lattice.centre), colours))  # some are negatives
+    mixture *= 0.5 ** np.arange(colours)
     half = (np.array(lattice.field) - 1) / 2
     origin = np.floor(lattice.centre - half).astype(int) - MARGIN
     grid = np.mgrid[: lattice.field[0] + 2 * MARGIN, : lattice.field[1] + 2 * MARGIN]
@@ -148,19 +149,45 @@ def test_units_beside_their_places_are_found():
     assert rms(error - error.mean(0)) < 0.02
 
 
-def test_a_lattice_that_moved_is_told_and_followed():
-    lattice = array()
-    views = capture(lattice, (3.0, 0.0, 0.0), colours=1)
-    beside = np.random.default_rng(2).normal(0, 0.3, (16, 2))
+@pytest.mark.parametrize("colours", [1, 3])
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_lattice_that_moved_is_told_and_followed(colours, seed):
+    lattice = array(5, 5, 110)
+    views = capture(lattice, (3.0, 0.0, 0.0), colours=colours, noise=0.03)
+    beside = np.random.default_rng(seed).normal(0, 0.3, (25, 2))
     thought = replace(views, offset=views.offset - beside)
-    _, offset, quality = place(thought, lattice, 8.0)
-    assert quality["lattice_moved"] > 0.1
+    _, offset, quality = place(thought, lattice, 8.0, refine=False)
+    assert not offset.any()
+    assert 0.15 < quality["lattice_moved"] < 0.5
+    _, offset, _ = place(thought, lattice, 8.0)
     assert rms(offset) > 0.1
     _, offset, quality = place(views, lattice, 8.0)
     assert quality["lattice_moved"] < 0.02
     assert not offset.any()
-    _, offset, _ = place(thought, lattice, 8.0, refine=False)
-    assert not offset.any()
+
+
+@pytest.mark.parametrize("kind", ["turned", "shifted", "stretched"])
+def test_of_whole_arrays_only_a_turn_is_seen(kind):
+    """A shift moves the picture, a stretch its distance; across baselines neither moves a thing."""
+    lattice, plane = array(), (3.0, 0.0, 0.0)
+    from_middle = lattice.centre - lattice.centre.mean(0)
+    from_middle = 0.3 * from_middle / rms(from_middle)
+    beside = {
+        "turned": from_middle @ [[0, -1], [1, 0]],
+        "shifted": np.full_like(lattice.centre, 0.3),
+        "stretched": from_middle,
+    }[kind]
+    views = capture(lattice, plane, colours=1)
+    thought = replace(views, offset=views.offset - beside)
+    found, _, quality = place(thought, lattice, 8.0, refine=False)
+    if kind == "turned":
+        # Half of the turn about the middle is the reference's own, a shift of everything.
+        assert quality["lattice_moved"] > 0.2
+    else:
+        assert quality["lattice_moved"] < 0.02
+    step = from_middle[1, 1] - from_middle[0, 1]  # by which the stretch moves neighbours apart
+    expected = 3.0 + (step if kind == "stretched" else 0)
+    assert found[0] == pytest.approx(expected, abs=0.02)
 
 
 def test_depth_is_not_taken_for_a_lattice_that_moved():

@@ -9,6 +9,7 @@ import torch
 import xarray as xr
 
 from squilla.calibration import depth as room
+from squilla.calibration import surfaces
 from squilla.calibration.alignment import measure
 from squilla.calibration.depth import Depth
 from squilla.calibration.rehearsal import poster
@@ -143,7 +144,7 @@ def test_paths_are_shortest_paths():
     cost = random.random((1, 5, 4)).astype(np.float32)
     slant, jump = 0.15, 0.4
     total = np.zeros((2, *cost.shape), np.float32)
-    room._semi_global(cost, np.float32(slant), np.full((1, 5), jump, np.float32), total)
+    surfaces._semi_global(cost, np.float32(slant), np.full((1, 5), jump, np.float32), total)
     step = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
     price = np.where(step == 0, 0, np.where(step == 1, min(slant, jump), jump))
     best = np.full((5, 4), np.inf)
@@ -165,7 +166,7 @@ def test_rows_are_solved_exactly():
     for x in range(8):
         matrix[x : x + 2, x : x + 2] += 7.0 * bond[0, x] * np.array([[1, -1], [-1, 1]])
     expected = np.linalg.solve(matrix, field[0, 0])
-    room._along_rows(field, bond.astype(np.float32), np.float32(7.0))
+    surfaces._along_rows(field, bond.astype(np.float32), np.float32(7.0))
     np.testing.assert_allclose(field[0, 0], expected, rtol=1e-4)
 
 
@@ -190,7 +191,7 @@ def test_hidden_points_are_those_that_a_painter_covers(baseline):
     """Whole shifts: the square is painted over the wall, and what it covers is hidden."""
     disparity = np.ones((40, 40), np.float32)
     disparity[12:26, 14:28] = 3.0
-    seen = room._seen(disparity, np.array([[0.0, 0.0], baseline]))
+    seen = surfaces.unhidden(disparity, np.array([[0.0, 0.0], baseline]))
     moved = np.zeros((40, 40), bool)  # where the unit sees the square, in the wall's coordinates
     shift = [round(2.0 * each) for each in baseline]
     moved[12 + shift[0] : 26 + shift[0], 14 + shift[1] : 28 + shift[1]] = True

@@ -46,15 +46,38 @@ class Evidence:
 
     pull : (M, 2 K) slope of the log likelihood, 1/px.
     precision : (M, 2 K, M, 2 K) its curvature, 1/px^2; zero for a shift of all units together.
-    relief : (2, B, B) pull and precision, 1/(px per pitch), of the disparity of each of B x B
-        parts of the field alone.
-    score : mean correlation of each unit's edges with those of the others; 0 for noise.
+    aligned : what it was told by.
     """
 
     pull: np.ndarray
     precision: np.ndarray
-    relief: np.ndarray
-    score: float
+    aligned: "Aligned"
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Edges of all units, aligned by a guess, and the pictures they are mixed from.
+
+    values : (M, 2 P) in units of the noise; along x, then along y.
+    halves : two of (M, M), inner products of the units over each half of the field, not scaled.
+    share : (M, R), orthonormal: values are about share @ common.
+    common : (R, 2 P) pictures.
+    slopes : (R, 2, 2 P) of the pictures along y and x, 1/px.
+    moved : (M, 2 K), products of values with how the first picture changes when it moves.
+    moves : (2 K, 2 K), products of those changes.
+    shape : (h, w) of a picture.
+    shared : number of points that share their noise.
+    """
+
+    values: np.ndarray
+    halves: list[np.ndarray]
+    share: np.ndarray
+    common: np.ndarray
+    slopes: np.ndarray
+    moved: np.ndarray
+    moves: np.ndarray
+    shape: tuple[int, int]
+    shared: float
 
 
 @dataclass(frozen=True)
@@ -65,8 +88,9 @@ class Placement:
         there to the last row's and the last column's middle.
     covariance : (3, 3) of `plane`, by the noise of the edges, were the units' places known.
     offset : (M, 2) px, by which each unit lies beside its place in the lattice.
-    leftover : (M, 2) px, by which single units would still move if each were free.
-    uncertainty : (M, 2) px, standard deviation of `leftover` by the noise.
+    leftover : (4, M, 2) px, by which each unit would still move by each quarter of the field, were
+        it free.
+    uncertainty : (4, M, 2) px, standard deviation of `leftover` by the noise.
     relief : (B, B) px per pitch, by which parts of the field lie beside the plane.
     flatness : (B, B) px per pitch, standard deviation of `relief` by the noise.
     score : mean correlation of each unit's edges with those of the others; 0 for noise.
@@ -110,14 +134,14 @@ def find_plane(
     -------
     Placement
     """
+    # Were single units free, several pictures would take for colour what is still misplaced.
+    stages = [(edges, 1 if free else _RANK)]
     if start is None:
         coarse = edges.directions()
         plane = np.array([_search(coarse, lattice, first, span), 0.0, 0.0])
-        stages = [(coarse, 1), (edges, 1), (edges, _RANK)]
+        stages = [(coarse, 1), (edges.thinned(), 1), *stages]
     else:
-        plane, stages = np.array(start, float), [(edges, 1), (edges, _RANK)]
-    if free:  # several pictures would take for colour what is still misplaced
-        del stages[-1]
+        plane, stages = np.array(start, float), [(edges, 1), *stages]
     offset = np.zeros(first.shape)
     for level, rank in stages:
         for _ in range(8):
@@ -128,22 +152,11 @@ def find_plane(
             change = max(np.abs(step).max() * _reach(lattice), np.abs(moved).max())
             if change < _NEAR:
                 break
-    pull, precision = found.relief
-    leftover, uncertainty = _single(found)
+    pull, precision = _relief(found.aligned, lattice.baseline)
     return Placement(
-        plane, covariance, offset, leftover, uncertainty,
-        pull / precision, precision**-0.5, found.score,
+        plane, covariance, offset, *_single(found.aligned),
+        pull / precision, precision**-0.5, _score(found.aligned),
     )  # fmt: skip
-
-
-def _single(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much each unit alone would still move, and by the noise, (M, 2) px."""
-    units, terms = len(evidence.pull), evidence.pull.shape[1] // 2
-    own = np.array([0, terms])
-    precision = evidence.precision[np.arange(units), :, np.arange(units)][:, own[:, None], own]
-    covariance = np.linalg.inv(precision + 1e-6 * np.eye(2))
-    shift = np.einsum("mab,mb->ma", covariance, evidence.pull[:, own])
-    return shift, np.sqrt(np.einsum("maa->ma", covariance))
 
 
 def fit_plane(disparity: np.ndarray) -> np.ndarray:
@@ -196,69 +209,126 @@ def compare(
     into = values.swapaxes(0, 1)
     resample(edges.values, edges.bad, place, baseline, disparity, CUBIC, into, seen)
     values = values.reshape(units, 2 * points)
-    common, share, spread, score = _common(values, seen.reshape(units, points), rank)
+    _fill_in(values, seen.reshape(units, points))
+    halves = _products(values)
+    share, spread = _mixtures(halves[0] + halves[1], 2 * points, rank)
     rank = share.shape[1]
-    slopes = _slopes(common.reshape(2 * rank, *shape)).reshape(rank, 2, 2, points) / edges.step
-    slopes = slopes.swapaxes(1, 2)  # (rank, axis, part, points)
-    moves = slopes[:, :, None] * grid[:terms, None].reshape(terms, 1, points).astype(np.float32)
-    moves = moves.reshape(rank * 2 * terms, 2 * points)
-    misfit = (values @ moves.T) / spread[:, None] - share @ (common @ moves.T)
-    gram = (moves @ moves.T).reshape(rank, 2 * terms, rank, 2 * terms).astype(float)
+    values /= spread[:, None].astype(np.float32)
+    common = share.T.astype(np.float32) @ values
+    slopes = _slopes(common, shape) / edges.step
+    moves = _moves(slopes, grid[:terms])
+    moved, gram = values @ moves.T, (moves @ moves.T).astype(float)
+    misfit = moved - share @ (common @ moves.T)
+    pull = -np.einsum("mr,mra->ma", share, misfit.reshape(units, rank, -1))
     free = np.eye(units) - share @ share.T
-    half = np.einsum("ir,rasb->iasb", share, gram)
+    half = np.einsum("ir,rasb->iasb", share, gram.reshape(rank, 2 * terms, rank, 2 * terms))
     precision = np.einsum("ij,iasb,js->iajb", free, half, share, optimize=True)
-    return Evidence(
-        -np.einsum("mr,mra->ma", share, misfit.reshape(units, rank, -1)) / edges.shared,
-        precision / edges.shared,
-        _relief(values, common, share, spread, free, slopes, lattice.baseline, shape)
-        / edges.shared,
-        score,
-    )
+    first_alone = slice(2 * terms)
+    aligned = Aligned(
+        values, halves, share, common, slopes, moved[:, first_alone],
+        gram[first_alone, first_alone], shape, edges.shared,
+    )  # fmt: skip
+    return Evidence(pull / edges.shared, precision / edges.shared, aligned)
 
 
-def _common(values: np.ndarray, seen: np.ndarray, rank: int) -> tuple:
-    """Return what units have in common: edges of all, and the share of each unit in them.
+def _fill_in(values: np.ndarray, seen: np.ndarray) -> None:
+    """Fill in what units do not see, (M, P), by the mean of the others: (M, 2 P), real first."""
+    if seen.all():
+        return
+    parts = values.reshape(len(values), 2, -1)
+    parts *= seen[:, None]
+    mean = parts.sum(0) / (seen.sum(0) + 1e-9)
+    share = np.einsum("mcp,cp->m", parts, mean) / (seen @ np.square(mean).sum(0) + 1e-9)
+    parts += np.where(seen[:, None], 0, share[:, None, None] * mean).astype(np.float32)
+
+
+def _products(values: np.ndarray) -> list[np.ndarray]:
+    """Return the units' inner products over each half of the field, two of (M, M)."""
+    parts = values.reshape(len(values), 2, -1)
+    middle = parts.shape[2] // 2
+    return [
+        (half[:, 0] @ half[:, 0].T + half[:, 1] @ half[:, 1].T).astype(float)
+        for half in (parts[..., :middle], parts[..., middle:])
+    ]
+
+
+def _mixtures(products: np.ndarray, count: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return how units mix the few pictures that explain most.
 
     Parameters
     ----------
-    values : array, (M, 2 P)
-        Real parts, then imaginary parts; what is not seen is filled in from the others.
-    seen : array, (M, P) bool
+    products : array, (M, M)
+        Inner products of the units' values.
+    count : int
+        Number of values of each unit.
     rank : int
         Most pictures that the units' edges are taken to be mixed from.
 
     Returns
     -------
-    common : array, (rank, 2 P)
-    share : array, (M, rank), orthonormal: values / spread is about share @ common.
+    share : array, (M, rank), orthonormal: values / spread is about share @ pictures.
     spread : array, (M,), standard deviation of each unit's noise.
-    score : float
     """
-    points = values.shape[1] // 2
-    if not seen.all():
-        parts = values.reshape(len(values), 2, points)
-        parts *= seen[:, None]
-        mean = parts.sum(0) / (seen.sum(0) + 1e-9)
-        share = np.einsum("mcp,cp->m", parts, mean) / (seen @ np.square(mean).sum(0) + 1e-9)
-        parts += np.where(seen[:, None], 0, share[:, None, None] * mean).astype(np.float32)
-    middle = points // 2
+    strength, vectors = np.linalg.eigh(products)
+    alone = np.diag(products) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
+    spread = np.sqrt(np.maximum(alone / count, 1e-5))
+    strength, vectors = np.linalg.eigh(products / np.outer(spread, spread))
+    clear = int(np.sum(strength > _FAINT * count))
+    rank = max(1, min(rank, len(products) // 6, clear))
+    return vectors[:, : -1 - rank : -1], spread
 
-    def products(start: int, stop: int) -> np.ndarray:
-        """Return the units' inner products over some points, (M, M)."""
-        real, imaginary = values[:, start:stop], values[:, points + start : points + stop]
-        return (real @ real.T + imaginary @ imaginary.T).astype(float)
 
-    upper, lower = products(0, middle), products(middle, points)
-    strength, vectors = np.linalg.eigh(upper + lower)
-    alone = np.diag(upper + lower) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
-    spread = np.sqrt(np.maximum(alone / values.shape[1], 1e-5))
-    strength, vectors = np.linalg.eigh((upper + lower) / np.outer(spread, spread))
-    clear = int(np.sum(strength > _FAINT * values.shape[1]))
-    rank = max(1, min(rank, len(values) // 6, clear))
-    share = vectors[:, : -1 - rank : -1]
-    common = (share / spread[:, None]).T.astype(np.float32) @ values
-    score = (_agreement(upper, lower) + _agreement(lower, upper)) / 2
-    return common, share, spread, score
+def _unmoved(aligned: Aligned, products: np.ndarray) -> np.ndarray:
+    """Return the shares in the first picture and in others that no shift has made, (M, R).
+
+    A unit that lies off shows the first picture and some of its slopes, as if that were another
+    colour. Where it is asked whether single units lie off, whatever those slopes explain must
+    therefore tell nothing of the other pictures.
+    """
+    first, moves = aligned.share[:, :1], aligned.moves
+    moves = moves + 1e-6 * np.trace(moves) / len(moves) * np.eye(len(moves))
+    rest = np.eye(len(first)) - first @ first.T
+    shifts = rest @ aligned.moved @ np.linalg.solve(moves, aligned.moved.T) @ rest
+    strength, vectors = np.linalg.eigh(rest @ products @ rest - shifts)
+    # Slopes are differences, and do not explain all that a shift has made.
+    least = max(_FAINT * aligned.values.shape[1], 0.1 * np.linalg.eigvalsh(shifts)[-1])
+    clear = int(np.sum(strength > least))
+    more = max(0, min(_RANK, len(first) // 6, clear + 1) - 1)
+    return np.hstack([first, vectors[:, ::-1][:, :more]])
+
+
+def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much each unit alone would still move in each quarter of the field.
+
+    Returns
+    -------
+    shift : array, (4, M, 2), px
+    uncertainty : array, (4, M, 2), px
+        Standard deviation by the noise.
+    """
+    products = (aligned.values @ aligned.values.T).astype(float)
+    share, first = _unmoved(aligned, products), aligned.share[:, 0]
+    values = aligned.values.reshape(-1, 2, *aligned.shape)
+    slopes = aligned.slopes[0].reshape(2, 2, *aligned.shape)
+    rows, columns = ((slice(0, size // 2), slice(size // 2, size)) for size in aligned.shape)
+    free = np.eye(len(first)) - share @ share.T
+    left = np.diag(free @ products @ free) / np.diag(free) / aligned.values.shape[1]
+    scale = 1 / (aligned.shared * np.maximum(left, 1e-6))[:, None]  # other colours are no noise
+    shifts, doubts = [], []
+    for quarter in [(..., row, column) for row in rows for column in columns]:
+        rise = slopes[quarter].reshape(2, -1)
+        pull = -first[:, None] * (free @ (values[quarter].reshape(len(first), -1) @ rise.T))
+        precision = (first**2 * np.diag(free))[:, None, None] * (rise @ rise.T)
+        covariance = np.linalg.inv(precision * scale[..., None] + 1e-3 * np.eye(2))
+        shifts.append(np.einsum("mab,mb->ma", covariance, pull * scale))
+        doubts.append(np.sqrt(np.einsum("maa->ma", covariance)))
+    return np.array(shifts), np.array(doubts)
+
+
+def _score(aligned: Aligned) -> float:
+    """Return the mean correlation of each unit's edges with those of the others; 0 for noise."""
+    upper, lower = aligned.halves
+    return (_agreement(upper, lower) + _agreement(lower, upper)) / 2
 
 
 def _agreement(one: np.ndarray, other: np.ndarray) -> float:
@@ -274,13 +344,15 @@ def _agreement(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.mean(np.sign(share) * alike))  # some units may show the negative
 
 
-def _relief(values, common, share, spread, free, slopes, baseline, shape) -> np.ndarray:
+def _relief(aligned: Aligned, baseline: np.ndarray) -> np.ndarray:
     """Return pull and precision of the disparity in each part of the field, (2, B, B)."""
+    share, shape = aligned.share, aligned.shape
     rank, points = share.shape[1], shape[0] * shape[1]
     along = (baseline.T[None] * share.T[:, None]).reshape(2 * rank, -1)  # (rank axis, M)
-    slopes = slopes.reshape(2 * rank, -1)
-    misfit = (along / spread).astype(np.float32) @ values
-    misfit -= (along @ share).astype(np.float32) @ common
+    slopes = aligned.slopes.reshape(2 * rank, -1)
+    misfit = along.astype(np.float32) @ aligned.values
+    misfit -= (along @ share).astype(np.float32) @ aligned.common
+    free = np.eye(len(share)) - share @ share.T
     pull = -(misfit * slopes).sum(0)
     precision = ((along @ free @ along.T).astype(np.float32) @ slopes * slopes).sum(0)
     rows, columns = (np.arange(size) * _PARTS // size for size in shape)
@@ -288,7 +360,7 @@ def _relief(values, common, share, spread, free, slopes, baseline, shape) -> np.
     sums = [
         np.bincount(part, each.reshape(2, points).sum(0), _PARTS**2) for each in (pull, precision)
     ]
-    return np.stack([sums[0], sums[1] + 1e-6]).reshape(2, _PARTS, _PARTS)
+    return np.stack([sums[0], sums[1] + 1e-6]).reshape(2, _PARTS, _PARTS) / aligned.shared
 
 
 @lru_cache(maxsize=16)  # asked again for every frame
@@ -305,18 +377,23 @@ def _grid(field: tuple[int, int], step: int) -> tuple:
     return shape, monomials(*shape) * scale[:, None, None], corner, scale
 
 
-def _slopes(picture: np.ndarray) -> np.ndarray:
-    """Return derivatives along y and x, (2, h, w) -> (2, 2, h, w), zero at the border."""
-    slopes = np.zeros((2, *picture.shape), np.float32)
+def _slopes(pictures: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return derivatives of pictures, (R, 2 P), along y and x, (R, 2, 2 P), zero at the border."""
+    pictures = pictures.reshape(-1, *shape)
+    slopes = np.zeros((2, *pictures.shape), np.float32)
     inner = slice(2, -2)
     for axis in (1, 2):
-        p = np.moveaxis(picture, axis, -1)
+        p = np.moveaxis(pictures, axis, -1)
         rise = (8 * (p[..., 3:-1] - p[..., 1:-3]) - (p[..., 4:] - p[..., :-4])) / 12
         np.moveaxis(slopes[axis - 1], axis, -1)[..., inner] = rise
-    border = np.ones(picture.shape[1:], bool)
-    border[inner, inner] = False
-    slopes[..., border] = 0
-    return slopes.swapaxes(0, 1)
+    slopes[..., :2, :], slopes[..., -2:, :], slopes[..., :2], slopes[..., -2:] = 0, 0, 0, 0
+    return np.moveaxis(slopes.reshape(2, len(pictures) // 2, 2 * shape[0] * shape[1]), 0, 1)
+
+
+def _moves(slopes: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return how pictures change by polynomial moves along y and x, (R 2 K, 2 P)."""
+    terms = np.tile(grid.reshape(len(grid), -1), 2).astype(np.float32)
+    return (slopes[:, :, None] * terms).reshape(-1, slopes.shape[-1])
 
 
 def _solve(evidence: Evidence, lattice: Lattice, plane, offset, free: float):

@@ -17,30 +17,50 @@ COSTLY = 0.02
 def misalignment(found: Placement, lattice: Lattice) -> float:
     """Return how far off the sub-images are expected to lie, RMS over units and field, px per axis.
 
-    The uncertainty of the plane by the noise, and what single units and single parts of the field
-    disagree with it beyond their own noise.
+    The uncertainty of the plane by the noise, what single parts of the field disagree with it
+    beyond their noise, and how far single units lie off, if that is so far that it can be nothing
+    else: smaller shifts are also seen where units mix colours.
     """
     length = float(np.mean(lattice.baseline**2))
     plane = length * float(np.diag(found.covariance) @ [1, 1 / 3, 1 / 3])  # y^2, x^2 over -1..1
-    noise = float(np.mean(found.uncertainty**2))
-    followed = found.offset.any()  # were single units free, they followed their noise
-    units = noise if followed else float(np.mean(found.leftover**2)) - noise
+    if found.offset.any():  # were single units free, they followed their noise
+        units = float(np.mean(np.sum(found.uncertainty**-2.0, 0) ** -1))
+    else:
+        units = _alike(found.leftover, found.uncertainty)
+        units = units if units > STALE**2 else 0.0
     relief = length * float(np.median(found.relief**2 - found.flatness**2))
-    return float(np.sqrt(plane + max(units, 0) + max(relief, 0)))
+    return float(np.sqrt(plane + units + max(relief, 0)))
 
 
 def drift(found: Placement, lattice: Lattice) -> float:
     """Return how far units lie beside their places in the lattice, RMS px.
 
-    Only across each unit's baseline, where no depth of the scene moves anything, and beyond the
-    noise: what is left is a lattice that has moved since its calibration.
+    Only across each unit's baseline, where no depth of the scene moves anything, and only as far as
+    the quarters of the field agree: what is left is a lattice that has moved since its calibration.
     """
     length = np.hypot(*lattice.baseline.T)
     some = length > 0
     across = (lattice.baseline[some] / length[some, None])[:, ::-1] * [1, -1]
-    shift = np.sum((found.leftover + found.offset)[some] * across, 1)
-    noise = np.sum((found.uncertainty[some] * across) ** 2, 1)
-    return float(np.sqrt(max(np.mean(shift**2 - noise), 0.0)))
+    shift = np.sum((found.leftover + found.offset)[:, some] * across, -1)
+    noise = np.sqrt(np.sum((found.uncertainty[:, some] * across) ** 2, -1))
+    return float(np.sqrt(max(_alike(shift, noise), 0.0)))
+
+
+def _alike(shift: np.ndarray, noise: np.ndarray) -> float:
+    """Return the mean square of shifts that the quarters of the field, first axis, agree on.
+
+    By products of different quarters: noise, and what looks like a shift in one quarter because
+    colours are mixed otherwise there, is not alike in another. Units count by how surely they tell,
+    up to `STALE`.
+    """
+    precision = noise**-2.0
+    total = np.sum(precision, 0)
+    both = np.sum(precision * shift, 0) ** 2 - np.sum((precision * shift) ** 2, 0)
+    square = both / (total**2 - np.sum(precision**2, 0))
+    weight = (1 / total + STALE**2) ** -2.0
+    # Of four quarters alike, each with four times the variance: what the noise alone may reach.
+    by_chance = np.sqrt(np.sum((weight / total) ** 2 * 8 / 3)) / weight.sum()
+    return float(np.average(square, weights=weight) - by_chance)
 
 
 def colour_error(y: Tensor, noise: np.ndarray, shift: float) -> float:
