@@ -17,6 +17,7 @@ import xarray as xr
 
 from squilla.batch import Recipe, reconstruct_all
 from squilla.errors import InputError
+from squilla.files.cube import load_cube
 from squilla.files.raw import list_frames, read_raw, write_raw
 
 
@@ -90,9 +91,7 @@ def test_a_folder_gets_a_file_for_each(night, serial, tmp_path):
     ]
     stack = xr.open_zarr(serial[0], consolidated=False).radiance
     for name in summary.done:
-        np.testing.assert_array_equal(
-            xr.load_dataarray(tmp_path / f"{name}.nc"), stack.sel(capture=name)
-        )
+        np.testing.assert_array_equal(load_cube(tmp_path / f"{name}.nc"), stack.sel(capture=name))
 
 
 def test_what_is_there_is_not_done_again(night, tmp_path):

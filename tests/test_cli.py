@@ -9,13 +9,13 @@ import sys
 import numpy as np
 import pytest
 import tifffile
-import xarray as xr
 from typer.testing import CliRunner
 
 from squilla.camera.design import design_path
 from squilla.cli.app import app
 from squilla.cli.steps import read_depth, read_known, read_sweep
 from squilla.errors import InputError
+from squilla.files.cube import load_cube
 
 SMALL = {
     "rows = 6 ": "rows = 4 ", "columns = 6 ": "columns = 4 ", "rows = 3000": "rows = 480",
@@ -62,7 +62,7 @@ def test_from_raw_frame_to_verdict(bench, tmp_path):
         "reconstruct", bench / "raw.tiff", "--calibration", bench / "camera.nc",
         "--model", "ridge", "-o", tmp_path / "cube.nc",
     )  # fmt: skip
-    cube = xr.load_dataarray(tmp_path / "cube.nc")
+    cube = load_cube(tmp_path / "cube.nc")
     assert cube.dims == ("y", "x", "wavelength")
     assert cube.wavelength.attrs["units"] == "nm"
     printed = run(
@@ -104,7 +104,7 @@ def test_several_frames_go_into_a_folder(bench, tmp_path):
     run(
         "reconstruct", bench / "raw.tiff", second, "--calibration", bench / "camera.nc", "-o", out
     )  # fmt: skip
-    one, other = (xr.load_dataarray(out / name) for name in ("raw.nc", "second.nc"))
+    one, other = (load_cube(out / name) for name in ("raw.nc", "second.nc"))
     np.testing.assert_array_equal(one, other)
 
 

@@ -4,11 +4,11 @@ import json
 
 import pytest
 import rasterio
-import xarray as xr
 
 from squilla.camera.design import design_path
 from squilla.demo import demo
 from squilla.errors import InputError
+from squilla.files.cube import load_cube
 from test_cli import SMALL
 
 
@@ -33,7 +33,7 @@ def test_demo_writes_everything(tmp_path):
     assert metrics["chart"]["ridge"]["colours_mse"] < 0.02
     for name in ("raw.tiff", "calibration.nc", "report.html"):
         assert (out / name).stat().st_size > 0
-    cube = xr.load_dataarray(out / "chart-ridge.nc")
+    cube = load_cube(out / "chart-ridge.nc")
     assert (cube.wavelength.values[0], cube.wavelength.attrs["units"]) == (500, "nm")
     with rasterio.open(out / "chart-ridge.img") as envi:
         assert envi.count == 51

@@ -96,7 +96,9 @@ def fill(image, bad):
                             count += 1
                 if count:
                     mean = np.float32(total / count)
-                    image[unit, row, column] = max(mean, image[unit, row, column])
+                    own = image[unit, row, column]
+                    # A lens blurs: what stands out of its good neighbours is a defect, no light.
+                    image[unit, row, column] = own if mean < own < 2 * mean else mean
 
 
 def windows(image: np.ndarray, lattice: Lattice, margin: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,9 @@ def export_model(
     output: Annotated[Path, typer.Option("-o", "--output", help="ONNX file to write.")],
     model: Annotated[str, typer.Option(help="A name of `squilla models`, or a file.")] = "mlp",
 ) -> None:
-    """Write a network in the ONNX format, which ONNX Runtime, OpenVINO and phones read.
+    """Write a network as ONNX, for other programs.
+
+    ONNX Runtime, OpenVINO and phones read it.
 
     A network of single pixels takes measurements divided by their maximum, (N, filters). Of
     `compound`, the three networks behind its front end are written, a file for each size of cells.

@@ -193,7 +193,9 @@ def check(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare today's dark frames and flats with a calibration: dust, hot pixels, moved filters.
+    """Compare darks and flats of today with a calibration.
+
+    Finds dust, hot pixels and moved filters.
 
     Example: squilla check camera.nc --dark dark --flat flat -o camera-today.nc
     """
@@ -330,8 +332,9 @@ def evaluate(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Say where a cube comes from and what its pixels are worth; judge it against a reference.
+    """Judge a cube by its own layers, or against a reference.
 
+    Says where it comes from and what its pixels are worth.
     With a reference, which is brought onto the wavelengths of the cube, metrics.json and
     report.html are written.
 

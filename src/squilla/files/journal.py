@@ -52,7 +52,10 @@ class Journal:
 
     def _read(self) -> None:
         self._stream.seek(0)
-        *lines, cut = self._stream.read().split("\n")
+        try:
+            *lines, cut = self._stream.read().split("\n")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{self.path} is damaged ({error}); give another output.") from error
         if cut:  # a killed run did not finish the last line
             self._stream.truncate(len("\n".join([*lines, ""]).encode()))
         try:

@@ -175,9 +175,10 @@ def _read_yaml(path: Path) -> list[_Part]:
             elif entry["type"] in _FORMULAS:
                 start, stop = map(float, entry["wavelength_range"].split())
                 constants = np.array(entry["coefficients"].split(), float)
-                parts.append(
-                    _formula(_FORMULAS[entry["type"]], constants, 1000 * start, 1000 * stop)
-                )
+                part = _formula(_FORMULAS[entry["type"]], constants, 1000 * start, 1000 * stop)
+                with np.errstate(all="ignore"):
+                    part.at(np.array([part.start]))  # refuses constants that are too few
+                parts.append(part)
             else:
                 raise InputError(
                     f"{path} gives its index as {entry['type']!r}; tables of n, k or nk and "
