@@ -70,6 +70,7 @@ def test_from_raw_frame_to_verdict(bench, tmp_path):
         "-o", tmp_path / "verdict", "--json",
     )  # fmt: skip
     metrics = json.loads(printed)
+    assert metrics.pop("provenance")["model"] == "ridge"
     assert metrics == json.loads((tmp_path / "verdict" / "metrics.json").read_text())
     assert metrics["gfc"] > 0.9
     assert "<html" in (tmp_path / "verdict" / "report.html").read_text()
@@ -86,7 +87,7 @@ def test_a_chart_and_lamps_instead_of_a_sweep(bench, tmp_path):
         "--json",
     )  # fmt: skip
     learnt = json.loads(printed)
-    assert learnt["known_spectra"] == 120
+    assert 116 <= learnt["known_spectra"] <= 120  # a defect may cost a patch of so few pixels
     assert 1 < learnt["effective_index"] < 3
     (tmp_path / "known" / "labels.png").write_text("no picture")
     with pytest.raises(InputError, match="labels"):
