@@ -50,7 +50,7 @@ class Stack:
             If there is no frame, or they differ in size or exposure.
         """
         count, first, exposure, camera, change = 0, None, None, "", 0.0
-        dark = level = np.float32(0)
+        dark, level = np.zeros((0, 0), np.float32), 1.0
         total = squares = np.zeros((0, 0), np.float32)
         for raw in raws:
             if first is None:  # what is summed is the small difference to it: float32 is enough

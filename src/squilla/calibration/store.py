@@ -145,7 +145,7 @@ def _digest(dataset: xr.Dataset) -> str:
         if values is not None:
             stored = np.ascontiguousarray(values.values)
             total = crc32(f"{stored.dtype.str[1:]} {stored.shape}".encode(), total)
-            total = crc32(stored.reshape(-1).view(np.uint8), total)
+            total = crc32(stored.reshape(-1).view(np.uint8).data, total)
     return f"{total:08x}"
 
 

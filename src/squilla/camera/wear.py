@@ -1,5 +1,6 @@
 """What years do to a camera: dust, dead units, hot pixels, warmth, leaks, swollen films."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -127,7 +128,8 @@ class _WornSensor(ImageSensor):
         rate = ImageSensor(self.design).dark_rate * np.float32(2 ** (self.wear.warmer / _DOUBLING))
         random = np.random.default_rng([self.wear.seed, 4])
         hot = random.integers(rate.size, size=round(self.wear.hot_pixels * rate.size))
-        rate.ravel()[hot] = np.exp(random.uniform(*np.log(_HOT), len(hot)))
+        low, high = map(math.log, _HOT)
+        rate.ravel()[hot] = np.exp(random.uniform(low, high, len(hot)))
         return rate
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from squilla.reconstruction.compiled import (
@@ -159,7 +160,7 @@ class Coded:
         )  # fmt: skip
         return cube
 
-    def at(self, rows: list[int], columns: list[int], basis: np.ndarray) -> np.ndarray:
+    def at(self, rows: ArrayLike, columns: ArrayLike, basis: np.ndarray) -> np.ndarray:
         """Return the spectra of some pixels, (N, K)."""
         row, column = np.asarray(rows), np.asarray(columns)
         whole = np.zeros((len(row), len(basis)), np.float32)

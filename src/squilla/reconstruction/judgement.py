@@ -107,11 +107,10 @@ def judge(
         "flag_masks": [int(doubt) for doubt in Doubt],
         "flag_meanings": " ".join(str(doubt.name).lower() for doubt in Doubt),
     }
-    where = {"dims": ("y", "x")}
     chi = {"long_name": "residual: mean squared difference of R x and y over the noise's variance"}
     return {
-        "residual": DataArray(residual.numpy(), **where, name="residual", attrs=chi),
-        "flags": DataArray(flags.numpy(), **where, name="flags", attrs=told),
+        "residual": DataArray(residual.numpy(), dims=("y", "x"), name="residual", attrs=chi),
+        "flags": DataArray(flags.numpy(), dims=("y", "x"), name="flags", attrs=told),
     }
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from squilla.calibration.alignment import Measurement
 from squilla.errors import InputError
@@ -51,9 +52,9 @@ class Reconstruction:
         """
         return self.cube().values @ np.asarray(weights, np.float32)
 
-    def spectra(self, rows: list[int], columns: list[int]) -> np.ndarray:
+    def spectra(self, rows: ArrayLike, columns: ArrayLike) -> np.ndarray:
         """Return the spectra of some pixels, (N, K)."""
-        return self.cube().values[rows, columns]
+        return self.cube().values[np.asarray(rows), np.asarray(columns)]
 
     def _checked(self, numbers: list[int]) -> list[int]:
         bands = len(self._model.wavelength)
@@ -71,15 +72,16 @@ class PointwiseReconstruction(Reconstruction):
             return super().bands(numbers)
         return some.reconstruct(self._measurement).values
 
-    def spectra(self, rows: list[int], columns: list[int]) -> np.ndarray:
+    def spectra(self, rows: ArrayLike, columns: ArrayLike) -> np.ndarray:
         if self._cube is not None:
             return super().spectra(rows, columns)
+        places = (np.asarray(rows), np.asarray(columns))
         parts = {
             name: getattr(self._measurement, name)
             for name in ("y", "valid", "angle", "disparity", "snr")
         }
         few = {
-            name: None if part is None else torch.as_tensor(part)[rows, columns][None]
+            name: None if part is None else torch.as_tensor(part)[places][None]
             for name, part in parts.items()
         }
         return self._model.reconstruct(replace(self._measurement, depth=None, **few)).values[0]
@@ -113,7 +115,7 @@ class CodedReconstruction(Reconstruction):
     def mixed(self, weights: np.ndarray) -> np.ndarray:
         return self._spelt(self._basis @ np.asarray(weights, np.float32))
 
-    def spectra(self, rows: list[int], columns: list[int]) -> np.ndarray:
+    def spectra(self, rows: ArrayLike, columns: ArrayLike) -> np.ndarray:
         return self._coded.at(rows, columns, self._basis)
 
     def _spelt(self, basis: np.ndarray) -> np.ndarray:
