@@ -9,7 +9,7 @@ folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")  # what `make demo` 
 
 calibration = sq.load_calibration(folder / "calibration.nc")
 measurement = sq.measure(sq.read_raw(folder / "raw.tiff"), calibration)  # aligned, (250, 250, 36)
-model = sq.load_model("mlp", calibration)
+model = sq.load_model("compound", calibration)
 cube = model.reconstruct(measurement)  # DataArray (y, x, wavelength)
 sq.save(cube, folder / "first.hdr")  # ENVI; .nc .zarr .tiff by suffix
 print(cube.sel(wavelength=600, method="nearest").mean().item())
