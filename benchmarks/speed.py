@@ -140,9 +140,8 @@ def from_raw(path: Path, engine: str, products: float, whole: float):
     from squilla.camera.twin import Camera
 
     calibration = squilla.load_calibration(path)
-    raw = Camera("thesis").capture(
-        load_scene("chart", grid()), distance=300, generator=np.random.default_rng(0)
-    )
+    generator = torch.Generator().manual_seed(0)
+    raw = Camera("thesis").capture(load_scene("chart", grid()), snr=30, generator=generator)
     model = load_model("compound", calibration, engine=engine)
     before = squilla.measure(raw, calibration)
 

@@ -70,7 +70,7 @@ def table(metrics: dict) -> str:
 def picture(folder: Path):
     """Draw a capture of the chart, what came of it, and four of its spectra."""
     raw = read_raw(folder / "raw.tiff").frame
-    cube = load_cube(folder / "chart-mlp.nc")
+    cube = load_cube(folder / "chart-compound.nc")
     truth = load_scene("chart", cube.wavelength.values)
     labels, names = chart_layout(250, 250), chart_reflectances().name
     white = lights()[CHART_LIGHT]
