@@ -35,7 +35,7 @@ from squilla.files.raw import Raw, read_raw, write_raw
 from squilla.reconstruction.reconstructor import load_model, model_class
 from squilla.spectra import lights
 
-MODELS = ("ridge", "sparse", "mlp", "compound")
+MODELS = ("ridge", "sparse", "compound")
 
 _TEXT = {
     "chart": "The 24 patches of a ColorChecker. The thesis averages its errors over the first 18.",
