@@ -277,6 +277,13 @@ def journalled(place) -> list[str]:
     return [line["name"] for line in lines if "name" in line and "failed" not in line]
 
 
+def test_a_scheduler_that_is_no_address_is_said_to_be_none(night, tmp_path):
+    with pytest.raises(InputError, match="No Dask scheduler answers at nowhere"):
+        reconstruct_all(
+            list_frames(night / "raw"), recipe(night), tmp_path / "o.zarr", scheduler="nowhere"
+        )
+
+
 @pytest.mark.slow
 def test_the_command_with_a_scheduler_and_workers_of_their_own(night, serial, tmp_path):
     """One film of many pages, through `dask scheduler` and two `dask worker` processes."""

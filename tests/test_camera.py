@@ -330,7 +330,8 @@ def test_impossible_captures_are_refused(camera, scene):
         camera.capture(scene, snr=np.nan)
     with pytest.raises(InputError, match="no light"):
         camera.capture(scene * 0, snr=20)
-    with pytest.raises(InputError, match="distance"):
-        camera.capture(scene, snr=20, distance=3.0)
+    for distance in (3.0, np.inf, np.nan):
+        with pytest.raises(InputError, match="distance"):
+            camera.capture(scene, snr=20, distance=distance)
     with pytest.raises(InputError, match="depth map"):
         camera.capture(scene, snr=20, depth=np.full((4, 4), 300.0))

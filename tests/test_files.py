@@ -129,6 +129,7 @@ def test_stack_and_folder_one_by_one(tmp_path):
     folder.mkdir()
     for number in (10, 2, 1):
         write_raw(folder / f"frame{number}.npy", Raw(np.full((2, 2), number, np.uint16), 1.0))
+    (folder / ".half-written.tiff").write_bytes(b"II")
     assert [int(raw.frame[0, 0]) for raw in read_raws(folder)] == [1, 2, 10]
     with pytest.raises(InputError, match="folder"):
         read_raw(folder)

@@ -416,7 +416,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, i
             ) from error
         try:
             client: Any = Client(scheduler, timeout=20)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             raise InputError(f"No Dask scheduler answers at {scheduler}: {error}") from error
         with client:
             threads = sum(client.nthreads().values())

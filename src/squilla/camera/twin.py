@@ -457,8 +457,10 @@ class Camera:
         far = self.design.array.pitch / 1000 * self.design.focal
         nearest = self.design.lens.focal_length / 1000 * 5
         if depth is None:
-            if not distance > nearest:
-                raise InputError(f"The distance must be above {nearest:g} mm, not {distance:g} mm.")
+            if not nearest < distance < np.inf:
+                raise InputError(
+                    f"The distance must be a number of mm above {nearest:g}, not {distance:g}."
+                )
             return far / distance
         depth = np.asarray(depth, float)
         if depth.shape != tuple(shape):

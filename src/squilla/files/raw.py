@@ -75,7 +75,9 @@ def list_frames(path: str | Path) -> list[Frame]:
 
 def _files(path: Path) -> list[Path]:
     if path.is_dir():
-        inside = [file for file in path.iterdir() if file.suffix.lower() in _READERS]
+        # Hidden ones are other programs' notes, or frames that are still being written.
+        seen = (file for file in path.iterdir() if not file.name.startswith("."))
+        inside = [file for file in seen if file.suffix.lower() in _READERS]
         if not inside:
             raise InputError(f"The folder {path} holds no raw frame ({', '.join(_READERS)}).")
         return sorted(inside, key=_natural)
