@@ -140,7 +140,7 @@ def test_settings_change_under_a_running_reader(twin, frames):
             for exposure in (2.0, 5.0, 3.0):
                 camera.exposure = exposure
                 with shown:
-                    shown.wait_for(lambda exposure=exposure: exposure in seen, timeout=10)
+                    shown.wait_for(lambda exposure=exposure: exposure in seen, timeout=60)
 
         setter = threading.Thread(target=change)
         setter.start()
@@ -323,7 +323,7 @@ def test_twelve_megapixels_arrive_bit_exact():
     with camera_within(frames, rate=10.0) as live:
         assert live.sensor == (3000, 4000)
         for _ in range(2):
-            raw = live.read(timeout=10)
+            raw = live.read(timeout=60)
             np.testing.assert_array_equal(raw.frame, sent(frames, raw))
 
 

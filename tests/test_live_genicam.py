@@ -60,7 +60,7 @@ def show(line: Line) -> tuple[dict, list]:
         answers.append(values)
 
 
-def until(line: Line, test, seconds: float = 20.0) -> tuple[dict, list]:
+def until(line: Line, test, seconds: float = 60.0) -> tuple[dict, list]:
     end = time.monotonic() + seconds
     while True:
         status, answers = show(line)

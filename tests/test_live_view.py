@@ -66,7 +66,7 @@ def live(frames, calibration) -> Iterator[LiveSource]:
     source.close()
 
 
-def until(test, seconds: float = 20.0):
+def until(test, seconds: float = 60.0):
     end = time.monotonic() + seconds
     while not (value := test()):
         assert time.monotonic() < end, "never came true"

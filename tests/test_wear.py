@@ -236,3 +236,20 @@ def test_dust_that_cannot_be_is_refused(design):
         worn(design, dust=(Dust(16),))
     with pytest.raises(InputError, match="transmittance"):
         Dust(0, transmittance=2.0)
+
+
+@pytest.mark.parametrize("times", [1.6, 5.0])
+def test_nothing_of_a_pixel_gone_hot_stays(camera, calibration, times):
+    """One pixel in every other unit is brightened; what is measured is what it was before."""
+    scene = load_scene("chart", camera.design.wavelength, camera.design.field.size)
+    scene = scene.copy(data=np.full(scene.shape, 0.5, np.float32))
+    whole = camera.capture(scene, snr=35, generator=torch.Generator().manual_seed(5))
+    frame = whole.frame.copy()
+    places = np.rint(calibration.lattice.centre[: len(calibration.lattice.centre) : 2]).astype(int)
+    black = camera.design.sensor.black_level
+    for y, x in places + 5:
+        frame[y, x] = black + (frame[y, x] - black) * times
+    before = measure(whole, calibration, distance=300.0)
+    after = measure(replace(whole, frame=frame), calibration, distance=300.0)
+    difference = (after.y - before.y).abs() / before.y.median()
+    assert float(difference.max()) < 0.2

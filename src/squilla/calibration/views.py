@@ -81,7 +81,11 @@ def _correct(
 
 @numba.njit(parallel=True, cache=True, nogil=True)
 def fill(image, bad):
-    """Put the mean of its good neighbours into each bad pixel of (M, H, W) pictures."""
+    """Put the mean of its good neighbours into each bad pixel of (M, H, W) pictures.
+
+    What was saturated keeps its value beside others as bright: it was at least that. A single one
+    that stands out of its neighbours twofold is a defect, for a lens spreads every point.
+    """
     units, rows, columns = image.shape
     for unit in numba.prange(units):
         for row in range(rows):
@@ -95,9 +99,7 @@ def fill(image, bad):
                             total += image[unit, y, x]
                             count += 1
                 if count:
-                    mean = np.float32(total / count)
-                    own = image[unit, row, column]
-                    # A lens blurs: what stands out of its good neighbours is a defect, no light.
+                    mean, own = np.float32(total / count), image[unit, row, column]
                     image[unit, row, column] = own if mean < own < 2 * mean else mean
 
 

@@ -143,6 +143,7 @@ def without_odd_pixels(views: SubImages, pixels: Pixels) -> tuple[SubImages, int
     if not found.any():
         return views, 0
     image = views.image.numpy().copy()
+    image[found] = 0  # nothing of it is to stay
     fill(image, bad)
     odd = int(inner(found, views.margin).sum())
     return replace(views, image=torch.from_numpy(image), bad=torch.from_numpy(bad)), odd

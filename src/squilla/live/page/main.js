@@ -446,7 +446,7 @@ function setTheme(name) {
 
 const stem = () => sources[number].title.replace(/\.[^.]+$/, "");
 const exportSpectra = () => save(`${stem()}-spectra.csv`, new Blob([spectra.csv()], { type: "text/csv" }));
-const exportPicture = () => savePicture(`${stem()}-${show.mode}.png`, view.image.canvas);
+const exportPicture = async () => savePicture(`${stem()}-${await show.painted()}.png`, view.image.canvas);
 const exportPlot = () => savePlot(`${stem()}-spectra.png`, plot);
 
 function menu(on) {

@@ -111,7 +111,18 @@ export class Show {
       this.again = true;
       return;
     }
-    this.fetching = true;
+    this.fetching = this.fetchAndPaint(asks);
+    await this.fetching;
+    this.fetching = null;
+    if (this.again) {
+      this.again = false;
+      this.refresh();
+    } else {
+      this.look();
+    }
+  }
+
+  async fetchAndPaint(asks) {
     const slow = setTimeout(() => this.told.waiting(true), 150);
     try {
       const pictures = await Promise.all(asks.map((ask) => this.fetch(ask)));
@@ -123,14 +134,13 @@ export class Show {
     } finally {
       clearTimeout(slow);
       this.told.waiting(false);
-      this.fetching = false;
     }
-    if (this.again) {
-      this.again = false;
-      this.refresh();
-    } else {
-      this.look();
-    }
+  }
+
+  /** Wait until what was asked for is painted; return the mode of what is. */
+  async painted() {
+    while (this.fetching) await this.fetching;
+    return this.shows;
   }
 
   async fetch(ask) {
@@ -173,7 +183,7 @@ export class Show {
     const whole = this.combine(pictures), { planes } = whole;
     const owner = pictures.length > 1 ? {} : pictures[0];
     this.sorted = owner.sorted ??= sample(this.mode === "colour" ? [luminance(planes)] : planes);
-    Object.assign(this, { whole, fine: null });
+    Object.assign(this, { whole, fine: null, shows: this.mode });
     if (this.auto) this.fitContrast();
     this.repaint();
     this.sharpen();
