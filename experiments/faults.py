@@ -32,8 +32,8 @@ from squilla.evaluation.chart import inner
 from squilla.evaluation.metrics import evaluate
 from squilla.files.raw import Raw
 from squilla.optics.merit import Prior, WhiteNoise, wiener
+from squilla.priors import natural_spectra
 from squilla.reconstruction.reconstructor import load_model
-from squilla.spectra import natural_spectra
 
 RESULTS = Path(__file__).parent / "results" / "faults.json"
 

@@ -16,6 +16,7 @@ from conftest import small_design
 from serving import Line, running
 from squilla.calibration.alignment import measure
 from squilla.camera.twin import Camera
+from squilla.colour import rgb_weights
 from squilla.errors import InputError
 from squilla.evaluation.metrics import sam
 from squilla.files.raw import Raw, read_raws, write_raw
@@ -26,7 +27,6 @@ from squilla.live.protocol import Picture, Spectra
 from squilla.live.record import Recorder
 from squilla.live.source import Counts, FolderFrames, MovingTwin, open_source
 from squilla.reconstruction.reconstructor import load_model
-from squilla.spectra import rgb_weights
 
 
 class Stack:

@@ -11,6 +11,7 @@ from random_camera import smooth_camera
 from squilla import InputError
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
+from squilla.priors import broad_spectra
 from squilla.reconstruction.linear import Ridge
 from squilla.reconstruction.reconstructor import (
     MODELS,
@@ -20,7 +21,6 @@ from squilla.reconstruction.reconstructor import (
     model_class,
     models,
 )
-from squilla.spectra import broad_spectra
 
 CAMERA = smooth_camera(0, filters=12, bands=48, angles=3)
 NETWORKS = [name for name in MODELS if model_class(name).trained]

@@ -16,7 +16,7 @@ from squilla.calibration.pixels import Darks, Stack
 from squilla.calibration.views import windows
 from squilla.errors import InputError
 from squilla.files.raw import Raw
-from squilla.spectra import second_moment
+from squilla.priors import second_moment
 
 _DRIFT = 0.3
 """Drift of the filters that is told, nm."""

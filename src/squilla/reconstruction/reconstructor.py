@@ -18,6 +18,7 @@ from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.files.disk import replacing
+from squilla.priors import broad_spectra
 from squilla.reconstruction.engine import (
     Network,
     check_engine,
@@ -26,7 +27,6 @@ from squilla.reconstruction.engine import (
     write_onnx,
 )
 from squilla.reconstruction.partial import PointwiseReconstruction, Reconstruction
-from squilla.spectra import broad_spectra
 
 if TYPE_CHECKING:
     from xarray import DataArray
