@@ -31,7 +31,8 @@ from squilla.camera.scenes import load_scene
 from squilla.evaluation.metrics import DARKEST, evaluate
 from squilla.optics.filters import StencilRecipe
 from squilla.reconstruction.compound import Compound
-from squilla.reconstruction.reconstructor import Reconstructor, load_model
+from squilla.reconstruction.models import load_model
+from squilla.reconstruction.reconstructor import Reconstructor
 from squilla.spectra import grid
 from squilla.training.compound import misaligned
 from squilla.training.noise import add_noise

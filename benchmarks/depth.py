@@ -38,7 +38,7 @@ from squilla.camera.solid import solid_scene
 from squilla.camera.twin import Camera
 from squilla.files.cube import labelled
 from squilla.reconstruction.linear import complete
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 from squilla.spectra import CHART_LIGHT, lights, reflectances
 
 RESULTS = Path(__file__).parent.parent / "experiments" / "results" / "depth.json"

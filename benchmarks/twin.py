@@ -14,7 +14,7 @@ from timing import seconds
 import squilla
 from squilla.calibration.rehearsal import Rehearsal
 from squilla.camera.scenes import load_scene
-from squilla.reconstruction.reconstructor import model_class
+from squilla.reconstruction.models import model_class
 
 
 def peak() -> float:

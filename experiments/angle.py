@@ -31,7 +31,7 @@ from squilla.files.cube import labelled
 from squilla.optics.angle import fit_effective_index
 from squilla.optics.merit import Prior, WhiteNoise, estimator_error, wiener
 from squilla.priors import PRIORS
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 from squilla.spectra import CHART_LIGHT, chart_reflectances, lights
 from squilla.training.noise import add_noise
 

@@ -36,7 +36,7 @@ from squilla.evaluation.metrics import evaluate
 from squilla.files.cube import labelled
 from squilla.files.raw import Raw
 from squilla.priors import gaussian_mixtures
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 from squilla.spectra import CHART_LIGHT, chart_reflectances, lights
 
 RESULTS = Path(__file__).parent / "results" / "cameras"

@@ -33,7 +33,7 @@ from squilla.evaluation.metrics import evaluate
 from squilla.files.raw import Raw
 from squilla.optics.merit import Prior, WhiteNoise, wiener
 from squilla.priors import natural_spectra
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 RESULTS = Path(__file__).parent / "results" / "faults.json"
 

@@ -25,7 +25,7 @@ from squilla.camera.scenes import chart_layout, load_scene
 from squilla.camera.twin import Camera
 from squilla.evaluation.chart import inner
 from squilla.evaluation.metrics import evaluate
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 RESULTS = Path(__file__).parent / "results" / "lens_colour.json"
 DISTANCE = 300.0

@@ -21,7 +21,7 @@ import torch
 import squilla
 from squilla.calibration.rehearsal import LAMPS, Rehearsal
 from squilla.priors import natural_spectra
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 from squilla.spectra import CHART_LIGHT, chart_reflectances, lights
 from squilla.training.noise import add_noise
 

@@ -29,7 +29,7 @@ from squilla.camera.scenes import load_scene
 from squilla.camera.twin import Camera
 from squilla.camera.wear import Dust, Wear, WornCamera, drop_rows
 from squilla.reconstruction.judgement import judge, told_of
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 RESULTS = Path(__file__).parent / "results" / "wear.json"
 PAGE = Path(__file__).parents[1] / "docs" / "wear.md"

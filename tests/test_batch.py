@@ -55,7 +55,7 @@ def serial(night, tmp_path_factory):
 def test_each_capture_is_its_own_cube_in_the_stack(night, serial):
     from squilla.calibration.alignment import measure
     from squilla.calibration.store import load_calibration
-    from squilla.reconstruction.reconstructor import load_model
+    from squilla.reconstruction.models import load_model
 
     output, summary = serial
     assert len(summary.done) == 5

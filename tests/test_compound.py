@@ -20,8 +20,8 @@ from squilla.reconstruction.evidence import (
     kinship,
     noise_factor,
 )
+from squilla.reconstruction.models import load_model
 from squilla.reconstruction.prior import Estimators, Prior, broad_prior, fit_mixture
-from squilla.reconstruction.reconstructor import load_model
 from squilla.spectra import CHART_LIGHT, grid, lights
 from squilla.training.compound import Recipe, Studio, misaligned, train_compound
 from squilla.training.noise import add_noise

@@ -19,7 +19,7 @@ from squilla.camera import warp
 from squilla.camera.solid import solid_scene
 from squilla.errors import InputError
 from squilla.files.cube import load_cube, save
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 
 def true_disparity(camera, depth):

@@ -26,7 +26,7 @@ from squilla.live.pipeline import LiveSource
 from squilla.live.protocol import Picture, Spectra
 from squilla.live.record import Recorder
 from squilla.live.source import Counts, FolderFrames, MovingTwin, open_source
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 
 class Stack:

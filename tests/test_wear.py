@@ -22,7 +22,7 @@ from squilla.camera.wear import Dust, Wear, WornCamera, drop_rows
 from squilla.cli.app import app
 from squilla.errors import InputError
 from squilla.files.raw import write_raw
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 
 def capture(camera, source="corn-kernel", snr=30.0, seed=1):

@@ -222,7 +222,7 @@ def _one_thread() -> Iterator[None]:
 def _loaded(recipe: Recipe, state: str) -> "tuple[Calibration, Reconstructor]":
     """Load what all captures share, once for each process and state of the files."""
     from squilla.calibration.store import load_calibration
-    from squilla.reconstruction.reconstructor import load_model
+    from squilla.reconstruction.models import load_model
 
     calibration = load_calibration(recipe.calibration)
     return calibration, load_model(recipe.model, calibration, recipe.engine)

@@ -32,7 +32,7 @@ from squilla.evaluation.report import Trial, results_section, scene_section, wri
 from squilla.files.cube import save
 from squilla.files.disk import replacing
 from squilla.files.raw import Raw, read_raw, write_raw
-from squilla.reconstruction.reconstructor import load_model, model_class
+from squilla.reconstruction.models import load_model, model_class
 from squilla.spectra import lights
 
 MODELS = ("ridge", "sparse", "compound")

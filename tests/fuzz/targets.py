@@ -22,7 +22,7 @@ from squilla.files.journal import Journal
 from squilla.files.raw import Raw, list_frames, read_raw, write_raw
 from squilla.optics.filters import StencilRecipe, read_filters
 from squilla.optics.materials import refractive_index
-from squilla.reconstruction.reconstructor import load_model, model_class
+from squilla.reconstruction.models import load_model, model_class
 
 CORPUS = Path(__file__).parent / "corpus"
 WAVELENGTH = np.array([500.0, 550.0, 600.0, 650.0, 750.0])

@@ -163,7 +163,7 @@ def models(
 
     Example: squilla models
     """
-    from squilla.reconstruction.reconstructor import models
+    from squilla.reconstruction.models import models
 
     if as_json:
         typer.echo(json.dumps(models(), indent=2))
