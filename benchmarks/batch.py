@@ -47,7 +47,7 @@ def make_captures() -> None:
     for count in (*COUNTS, DIFFERENT):
         (WORK / f"{count}").mkdir(parents=True, exist_ok=True)
     rate = camera.rate(load_scene("corn-kernel", camera.design.wavelength, 124))
-    exposure = camera.sensor.exposure_for(camera._fields(rate), 25.0)
+    exposure = camera.sensor.exposure_for(camera.fields(rate), 25.0)
     for number in range(max(COUNTS)):
         for count in (*COUNTS, DIFFERENT):
             path = WORK / f"{count}" / f"shot{number}.tiff"

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from squilla import __version__
 from squilla.errors import InputError
-from squilla.files.disk import flush
+from squilla.files.disk import flush, make_folder
 from squilla.files.journal import Journal, stamp, stop_on_disk_error
 from squilla.files.raw import Frame
 
@@ -121,7 +121,7 @@ def reconstruct_all(
     path = output.with_suffix(".journal.jsonl") if stacked else output / "journal.jsonl"
     if stacked and output.exists() and not path.exists():
         raise InputError(f"{output} is there, and {path.name} is not: give another output.")
-    _make_folder(output)
+    make_folder(output)
     with Journal(path, recipe.state()) as journal:
         summary = Summary({name: told for name, told in journal.done.items() if name in named})
         for name in list(summary.done):
@@ -369,13 +369,6 @@ class _Stack:
         told = xr.Dataset(columns, attrs=self._opened().attrs)
         with stop_on_disk_error(self.path):
             told.to_zarr(self.path, mode="a", zarr_format=3, consolidated=False)
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"The folder {path} cannot be made: {error.strerror}.") from error
 
 
 # --- workers ----------------------------------------------------------------------------------
