@@ -9,7 +9,7 @@ import typer
 from squilla.errors import InputError
 
 if TYPE_CHECKING:
-    from squilla.batch import Recipe
+    from squilla.batch.captures import Recipe
     from squilla.files.raw import Frame
 
 
@@ -30,6 +30,9 @@ def reconstruct(
         str | None,
         typer.Option(help="Runs the networks: torch, openvino, openvino-bf16, onnxruntime, cuda."),
     ] = None,
+    interval: Annotated[
+        bool, typer.Option("--interval", help="Save how far it may be off, 90 %: `compound`.")
+    ] = False,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes for many frames; default: every core.")
     ] = None,
@@ -43,10 +46,13 @@ def reconstruct(
     Many frames go into a folder, a NetCDF file each, or into one .zarr along a dimension
     "capture". A run that was interrupted goes on where it was when it is started again.
 
+    Beside each cube lie its layers: what every pixel is worth (residual, flags), its depth, and
+    with --interval its uncertainty: nine of ten true values lie within it.
+
     Examples: squilla reconstruct raw.tiff --calibration camera.nc --model ridge -o cube.nc;
     squilla reconstruct night/ --calibration camera.nc --model mlp -o night.zarr
     """
-    from squilla.batch import Recipe, reconstruct_one
+    from squilla.batch.captures import Recipe, reconstruct_one
     from squilla.cli.checks import check_distance, check_file
     from squilla.files.cube import CUBE_SUFFIXES, save
     from squilla.files.raw import list_frames
@@ -54,7 +60,7 @@ def reconstruct(
     check_distance(distance)
 
     frames = [frame for path in raw for frame in list_frames(path)]
-    recipe = Recipe(calibration, model, distance, depth, engine)
+    recipe = Recipe(calibration, model, distance, depth, engine, interval)
     into = output.is_dir() and output.suffix != ".zarr"
     if len(frames) > 1 or into:
         if not into and output.suffix != ".zarr":
@@ -95,7 +101,7 @@ def _reconstruct_many(
         TimeRemainingColumn,
     )
 
-    from squilla.batch import reconstruct_all
+    from squilla.batch.captures import reconstruct_all
 
     columns = TextColumn("captures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=Console(stderr=True), disable=as_json) as progress:
