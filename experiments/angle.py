@@ -212,7 +212,7 @@ def frames(camera: squilla.Camera, learnt: Calibration) -> dict:
         for wanted in SNRS:
             snr = min(wanted, 32.0)  # one exposure of this scene reaches no more
             count = round(10 ** ((wanted - snr) / 10))
-            exposure = twin.sensor.exposure_for(twin._fields(rate), snr)
+            exposure = twin.sensor.exposure_for(twin.fields(rate), snr)
             y = 0.0
             for number in range(count):
                 raw = twin.expose(rate, exposure, torch.Generator().manual_seed(50 + number))

@@ -82,7 +82,7 @@ def main() -> None:
         near = (labels >= 0) & (inner(labels, 3) < 0)  # the outermost 3 px of each patch
         rate = camera.rate(scene, distance=DISTANCE)
         for snr in (20.0, 30.0, 34.0):
-            exposure = camera.sensor.exposure_for(camera._fields(rate), snr)
+            exposure = camera.sensor.exposure_for(camera.fields(rate), snr)
             raw = camera.expose(rate, exposure, torch.Generator().manual_seed(1))
             measurement = measure(raw, calibration, distance=DISTANCE)
             noise = 10 ** (-snr / 10) * 30  # detail holds a small part of the power

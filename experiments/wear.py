@@ -76,7 +76,7 @@ def of(kind: str, wear: Wear) -> dict:
     camera = WornCamera("thesis", wear)
     scene = load_scene("corn-kernel", camera.design.wavelength, camera.design.field.size)
     sound = Camera("thesis")
-    exposure = sound.sensor.exposure_for(sound._fields(sound.rate(scene)), SNR)
+    exposure = sound.sensor.exposure_for(sound.fields(sound.rate(scene)), SNR)
     raw = camera.expose(camera.rate(scene), exposure, torch.Generator().manual_seed(3))
     if "rows" in kind:
         raw = drop_rows(raw, 1270, 80, repeated="stale" in kind)

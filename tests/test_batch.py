@@ -15,7 +15,7 @@ import tifffile
 import torch
 import xarray as xr
 
-from squilla.batch import Recipe, reconstruct_all
+from squilla.batch.captures import Recipe, reconstruct_all
 from squilla.errors import InputError
 from squilla.files.cube import load_cube
 from squilla.files.raw import list_frames, read_raw, write_raw
@@ -167,7 +167,7 @@ def test_pages_of_a_tiff_are_captures(night, tmp_path):
 
 def run_in_background(night, output) -> subprocess.Popen:
     code = (
-        "import sys; from pathlib import Path; from squilla.batch import *; "
+        "import sys; from pathlib import Path; from squilla.batch.captures import *; "
         "from squilla.files.raw import list_frames\n"
         "if __name__ == '__main__': reconstruct_all(list_frames(Path(sys.argv[1]) / 'raw'), "
         "Recipe(Path(sys.argv[1]) / 'camera.nc', distance=300.0), Path(sys.argv[2]), workers=2)"

@@ -230,7 +230,7 @@ def test_each_depth_has_its_own_defocus(camera, scene):
     depth[:, 45:] = 600.0
     unit = camera.design.field.reference
     both, near, far = (
-        camera._fields(each)[unit]
+        camera.fields(each)[unit]
         for each in (
             camera.rate(scene, depth=depth),
             camera.rate(scene, distance=60.0),

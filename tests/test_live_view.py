@@ -54,7 +54,7 @@ class Stack:
 def frames(camera, scene) -> list[Raw]:
     rate = camera.rate(scene)
     generator = torch.Generator().manual_seed(1)
-    exposure = camera.sensor.exposure_for(camera._fields(rate), 30.0)
+    exposure = camera.sensor.exposure_for(camera.fields(rate), 30.0)
     return [camera.expose(rate * (1 + 0.1 * n), exposure, generator) for n in range(3)]
 
 

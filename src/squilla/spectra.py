@@ -5,6 +5,7 @@ sensitivity R = transmittance x quantum efficiency and no further factor.
 """
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache
 from importlib.resources import files as package_files
 from typing import TYPE_CHECKING
@@ -62,7 +63,11 @@ class SpectralTable:
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.name:
-            raise InputError(f"There is no spectrum named {name!r}; there are {list(self.name)}.")
+            near = get_close_matches(name, self.name, 5, 0.0)
+            raise InputError(
+                f"There is no spectrum named {name!r} among {len(self.name)}; the nearest are "
+                f"{', '.join(near)}."
+            )
         return self.values[self.name.index(name)]
 
 

@@ -13,11 +13,12 @@ import numpy as np
 import tifffile
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.lessons import read_sweep
 from squilla.calibration.store import load_calibration
 from squilla.camera.design import CameraDesign
-from squilla.cli.steps import read_depth, read_sweep
 from squilla.errors import InputError
 from squilla.files.cube import labelled, load_cube, read_scene, save
+from squilla.files.depth import read_depth
 from squilla.files.journal import Journal
 from squilla.files.raw import Raw, list_frames, read_raw, write_raw
 from squilla.optics.filters import StencilRecipe, read_filters

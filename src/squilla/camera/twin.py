@@ -191,7 +191,7 @@ class Camera:
         rate = self.rate(scene, distance=distance, depth=depth)
         if exposure is None:
             assert snr is not None
-            exposure = self.sensor.exposure_for(self._fields(rate), snr)
+            exposure = self.sensor.exposure_for(self.fields(rate), snr)
         return self.expose(rate, exposure, generator)
 
     def capture_sequence(
@@ -229,12 +229,6 @@ class Camera:
             rates = self.rate(one, distance=distance) if still is None else still
             yield self.expose(rates[channel], exposure / count, generator)
 
-    def capture_flat(
-        self, light: np.ndarray, exposure: float, *, generator: Generator | None = None
-    ) -> Raw:
-        """Take a frame of an evenly lit surface that fills every view, spectrum `light` (K,)."""
-        return self.expose(self.flat_rate(light), exposure, generator)
-
     def capture_dark(self, exposure: float, *, generator: Generator | None = None) -> Raw:
         """Take a frame with the lens covered."""
         return self.expose(np.zeros(self.design.sensor_shape, np.float32), exposure, generator)
@@ -268,7 +262,7 @@ class Camera:
         frame = self.sensor.expose(rate, exposure, generator=generator)
         return Raw(frame, exposure, {"camera": self.serial, "bits": self.design.sensor.bits})
 
-    def _fields(self, image: np.ndarray) -> np.ndarray:
+    def fields(self, image: np.ndarray) -> np.ndarray:
         """Return the pixels within the units' fields, (M, size, size)."""
         size = self.design.field.size
         corner = np.rint(self.design.centres - (size - 1) / 2).astype(int)

@@ -253,6 +253,16 @@ class Reconstructor(nn.Module):
             cube = self(y.to(device), angle, snr, scale)
         return self.labelled(cube.cpu().numpy(), measurement, scale)
 
+    def reconstruct_interval(self, measurement: Measurement) -> "tuple[DataArray, DataArray]":
+        """Return the cube, and half the width of the interval that holds nine in ten of its values.
+
+        Raises
+        ------
+        InputError
+            If this model does not know how far it is off.
+        """
+        raise InputError(f"`{self.name}` does not tell how far it may be off; `compound` does.")
+
     def look(self, measurement: Measurement) -> Reconstruction:
         """Return a reconstruction that works out only what is asked: bands, spectra, colours."""
         return PointwiseReconstruction(self, measurement)
