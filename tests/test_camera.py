@@ -333,3 +333,19 @@ def test_impossible_captures_are_refused(camera, scene):
             camera.capture(scene, snr=20, distance=distance)
     with pytest.raises(InputError, match="depth map"):
         camera.capture(scene, snr=20, depth=np.full((4, 4), 300.0))
+
+
+def test_a_changed_design_is_a_new_one():
+    """Nothing that was worked out for the old one stays, and nonsense is refused."""
+    design = CameraDesign.load()
+    before, bands = np.ptp(design.centres), len(design.wavelength)
+    array = design.array.model_copy(update={"pitch": 800.0})
+    band = design.band.model_copy(update={"start": 550.0, "stop": 700.0, "step": 10.0})
+    changed = design.model_copy(update={"array": array, "band": band})
+    ratio = 800.0 / design.array.pitch
+    assert np.ptp(changed.centres) == pytest.approx(ratio * before, rel=0.01)
+    assert abs(ratio - 1) > 0.05
+    assert (bands, len(changed.wavelength)) == (251, 16)
+    field = design.field.model_copy(update={"reference": 99})
+    with pytest.raises(InputError, match="reference must be one of the units"):
+        design.model_copy(update={"field": field})

@@ -77,3 +77,11 @@ def test_composite_takes_the_thesis_bands():
     assert composite(np.zeros((2, 2, 251)), grid()).max() == 0
     light = lights()[CHART_LIGHT]
     np.testing.assert_allclose(composite(0.3 * light, grid(), white=light, scale=1), 0.3)
+
+
+def test_a_pixel_without_a_value_is_black_and_leaves_the_others():
+    cube = np.ones((10, 10, 251))
+    cube[3, 4] = np.nan
+    picture = composite(cube, grid())
+    assert (picture[3, 4] == 0).all()
+    assert (np.delete(picture.reshape(100, 3), 34, 0) == 1).all()

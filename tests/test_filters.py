@@ -248,7 +248,7 @@ def test_imec_responses():
 
 
 def test_mat_without_wavelength_asks_for_it():
-    with pytest.raises(InputError, match="wavelength="):
+    with pytest.raises(InputError, match="names no wavelengths"):
         read_filters(str(IMEC))
     with pytest.raises(InputError, match="601"):
         read_filters(str(IMEC), wavelength=grid(400, 999))
@@ -378,3 +378,13 @@ def test_analyse_refuses_nonsense():
     ):
         result = CliRunner().invoke(app, ["analyse", *arguments])
         assert isinstance(result.exception, InputError), arguments
+
+
+def test_cavities_too_alike_to_be_made_are_refused():
+    with pytest.raises(InputError, match="less than can be deposited"):
+        FabryPerotRecipe(36, band=(600.0, 650.0), order=(1, 1)).draw(0)
+
+
+def test_free_filters_need_a_layer():
+    with pytest.raises(InputError, match="one filter or more"):
+        FreeRecipe(filters=0)

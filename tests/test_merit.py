@@ -239,3 +239,10 @@ def test_random_arrays_resemble_the_published_kind():
     assert 0.35 < through < 0.6
     assert 0.2 < correlation < 0.45
     assert 0.9 < peaks < 1.5
+
+
+def test_a_row_without_variation_correlates_with_none():
+    rows = torch.rand(3, 40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    pair = abs(np.corrcoef(rows[:2])[0, 1])
+    rows[2] = 0.4
+    assert float(merit.mean_correlation(rows)) == pytest.approx(pair / 3)

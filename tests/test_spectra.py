@@ -6,7 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from squilla.errors import InputError
-from squilla.spectra import CHART_LIGHT, chart_reflectances, grid, lights, reflectances, resample
+from squilla.spectra import (
+    CHART_LIGHT,
+    chart_reflectances,
+    grid,
+    lights,
+    nanometres,
+    reflectances,
+    resample,
+)
 
 
 @pytest.mark.parametrize(
@@ -79,3 +87,19 @@ def test_tables_are_physical():
     with pytest.raises(InputError, match="candle"):
         lights().one("candle", grid())
     np.testing.assert_array_equal(lights().one(CHART_LIGHT, grid()), lights()[CHART_LIGHT])
+
+
+@pytest.mark.parametrize(
+    ("wavelength", "said"),
+    [
+        ([0.5, 0.6], "multiply micrometres"),
+        ([5e-7, 6e-7], "cannot be in nm"),
+        ([600, 500], "increase"),
+        ([500, np.nan], "finite"),
+        ([], "list of finite"),
+    ],
+)
+def test_wavelengths_that_are_none(wavelength, said):
+    with pytest.raises(InputError, match=said):
+        nanometres(wavelength)
+    np.testing.assert_array_equal(nanometres([500, 510]), [500.0, 510.0])

@@ -253,3 +253,9 @@ def test_nothing_of_a_pixel_gone_hot_stays(camera, calibration, times):
     after = measure(replace(whole, frame=frame), calibration, distance=300.0)
     difference = (after.y - before.y).abs() / before.y.median()
     assert float(difference.max()) < 0.2
+
+
+def test_flats_that_are_none_are_refused(camera, calibration):
+    covered = [camera.capture_dark(5.0) for _ in range(4)]
+    with pytest.raises(InputError, match="no brighter than the darks"):
+        check(calibration, dark=Rehearsal(camera).dark(), flat=covered)

@@ -168,5 +168,6 @@ def composite(
     picture = np.asarray(cube)[..., nearest]
     if white is not None:
         picture = picture / np.maximum(np.asarray(white, float)[nearest], 1e-12)
+    picture = np.nan_to_num(picture)
     scale = float(np.percentile(picture, 99.5)) if scale is None else scale
-    return np.clip(np.nan_to_num(picture) / max(scale, 1e-12), 0, 1)
+    return np.clip(picture / max(scale, 1e-12), 0, 1)

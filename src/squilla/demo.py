@@ -59,8 +59,8 @@ def demo(
 ) -> dict:
     """Capture, calibrate, align, reconstruct, judge, draw.
 
-    Writes raw frames, ``calibration.nc``, the cubes as .nc and .hdr, ``metrics.json`` and
-    ``report.html``.
+    Writes raw frames, ``calibration.nc``, the cubes as .nc and .hdr, the truth as .nc,
+    ``metrics.json`` and ``report.html``.
 
     Parameters
     ----------
@@ -96,9 +96,16 @@ def demo(
             f"The scenes {', '.join(scenes)} at {distance:g} mm and {snr:g} dB cannot be shown; "
             f"there are {', '.join(SCENES)} and doll, at any positive distance and finite SNR."
         )
+    if not scenes or not models:
+        raise InputError("Name one scene and one model, or more.")
     for name in models:
         model_class(name)
     twin = Camera(camera)
+    if twin.design.filters.layout != "array":
+        raise InputError(
+            f"The filters of {twin.design.name!r} are in a {twin.design.filters.layout} layout; "
+            "the demo shows cameras with a lens array."
+        )
     make_folder(folder)
     with _progress() as progress, ThreadPoolExecutor(1) as pool:
         warm = pool.submit(_warm_up, models)
@@ -128,6 +135,7 @@ def demo(
                 for suffix in (".nc", ".hdr"):
                     save(cubes[model], folder / f"{name}-{model}{suffix}")
             truth = twin.truth(scene, distance=distance, depth=relief)
+            save(truth.cube.rename("radiance"), folder / f"truth{f'-{name}' if number else ''}.nc")
             trial = _trial(name, truth, cubes, seconds, raw, calibration, measurement)
             trials.append(trial)
             metrics[name] = {
@@ -150,7 +158,7 @@ def demo(
             folder / "report.html",
             sections,
             title="From one exposure to a spectrum in every pixel",
-            text="Scenes seen once by the digital twin of the thesis' camera and "
+            text=f"Scenes seen once by the digital twin of the camera {twin.design.name!r} and "
             "reconstructed from its raw frames alone. The truth is used only to judge.",
             facts=facts,
         )

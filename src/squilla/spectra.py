@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from importlib.resources import files as package_files
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from squilla.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 CHART_LIGHT = "LED-B3"
 """The white LED of every evaluation scene; kept out of the training lights."""
@@ -39,6 +36,27 @@ def grid(start: float = 500.0, stop: float = 750.0, step: float = 1.0) -> np.nda
             "below the stop and a positive step."
         )
     return np.linspace(start, stop, round(steps) + 1)
+
+
+def nanometres(wavelength: ArrayLike) -> np.ndarray:
+    """Return wavelengths, (K,), as numbers if they can be in nm.
+
+    Raises
+    ------
+    InputError
+        If they are not finite and increasing, or none of 100 to 30 000 nm, as in micrometres.
+    """
+    values = np.asarray(wavelength, float)
+    if values.ndim != 1 or not len(values) or not np.isfinite(values).all():
+        raise InputError("Wavelengths must be a list of finite numbers, in nm.")
+    if (np.diff(values) <= 0).any():
+        raise InputError("Wavelengths must increase from band to band; sort the bands first.")
+    if not 100 <= values[0] <= values[-1] <= 30_000:
+        raise InputError(
+            f"Wavelengths of {values[0]:g} to {values[-1]:g} cannot be in nm; multiply micrometres "
+            "by 1000."
+        )
+    return values
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from squilla.errors import InputError
+from squilla.spectra import nanometres
 
 DARK_BLOCK = 8
 """Side of the blocks over which the sensor's dark parts are averaged, px."""
@@ -114,7 +115,7 @@ class Pixels:
         return self.bias + self.dark_rate * np.float32(exposure or 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Calibration:
     """Everything that frames taught us about one camera.
 
@@ -147,8 +148,11 @@ class Calibration:
             )
         if not np.all(np.isfinite(self.sensitivity)):
             raise InputError("The sensitivity holds NaN or infinite values; repair the table.")
-        if not (np.all(np.diff(self.wavelength) > 0) and np.all(np.diff(self.angle) > 0)):
-            raise InputError("The wavelengths and the angles of a calibration must increase.")
+        nanometres(self.wavelength)
+        if not np.all(np.diff(self.angle) > 0):
+            raise InputError("The angles of a calibration must increase.")
+        if not self.sensitivity.mean() > 0:
+            raise InputError("The sensitivity is not positive on the whole; is its sign right?")
         if self.deviations is not None and (
             self.deviations.shape[1:] != expected or not np.all(np.isfinite(self.deviations))
         ):
@@ -160,6 +164,15 @@ class Calibration:
             raise InputError(
                 f"The lattice has {len(self.lattice.centre)} units, the sensitivity {self.filters}."
             )
+
+    def __repr__(self) -> str:
+        band = f"{self.wavelength[0]:g}-{self.wavelength[-1]:g} nm"
+        known = [name for name in ("lattice", "pixels") if getattr(self, name) is not None]
+        about = "response matrix alone" if not known else f"with {' and '.join(known)}"
+        return (
+            f"<Calibration: {self.filters} channels, {len(self.wavelength)} bands, {band}, "
+            f"{len(self.angle)} field angles, {about}>"
+        )
 
     @classmethod
     def from_sensitivity(

@@ -130,6 +130,8 @@ def check(calibration: Calibration, *, dark: Iterable[Raw], flat: Iterable[Raw])
     spread = 1.4826 * float(np.median(np.abs(level - usual - risen)[lit]))
     hot = lit & (level - usual - risen > max(12 * spread, 4.0))
     light = flats.mean - level
+    if not float(np.median(light[lit])) > 10 * max(spread, 1.0):
+        raise InputError("The flats are no brighter than the darks; give frames of the lit lamp.")
     relative = np.where(lit, light / np.maximum(pixels.flat, 0.1), 0)
     now = white_levels(light, lattice, pixels) / (flats.exposure or 1.0)
     drift, error, lamp, response = _drift(calibration, now / white)

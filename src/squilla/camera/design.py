@@ -1,10 +1,11 @@
 """The design of a camera: one TOML file, validated, from which the twin is built."""
 
 import tomllib
+from collections.abc import Mapping
 from functools import cached_property
 from importlib.resources import files as package_files
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -218,6 +219,16 @@ class CameraDesign(_Section):
     walls: Walls | None = None
     effects: Effects = Effects()
 
+    def model_copy(
+        self, *, update: Mapping[str, Any] | None = None, deep: bool = False
+    ) -> "CameraDesign":
+        """Return a design with some sections changed, checked like one that was read."""
+        sections = {name: getattr(self, name) for name in type(self).model_fields}
+        try:
+            return type(self)(**sections | dict(update or {}))
+        except ValidationError as error:
+            raise _refused("The changed design", error) from error
+
     @classmethod
     def load(cls, source: str | Path = "thesis") -> "CameraDesign":
         """Read a design.
@@ -245,11 +256,7 @@ class CameraDesign(_Section):
         try:
             return cls.model_validate(tree)
         except ValidationError as error:
-            first = error.errors()[0]
-            place = ".".join(map(str, first["loc"]))
-            said = first["msg"].removeprefix("Value error, ")
-            about = f"{place}: {said}" if place else said
-            raise InputError(f"The camera design {path}: {about}.") from error
+            raise _refused(f"The camera design {path}", error) from error
 
     @model_validator(mode="after")
     def _fits(self):
@@ -344,6 +351,14 @@ class CameraDesign(_Section):
         """Quantum efficiency on the band's grid, (K,), 0..1."""
         table = self.sensor.quantum_efficiency
         return np.interp(self.wavelength, table.wavelength, table.value)
+
+
+def _refused(what: str, error: ValidationError) -> InputError:
+    """Return in one sentence what is wrong with a design."""
+    first = error.errors()[0]
+    place = ".".join(map(str, first["loc"]))
+    said = first["msg"].removeprefix("Value error, ")
+    return InputError(f"{what}: {f'{place}: {said}' if place else said}.")
 
 
 def designs() -> list[str]:

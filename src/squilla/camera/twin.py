@@ -60,8 +60,9 @@ class Camera(Projection):
 
         A filter table counts by what it holds, not by where it lies.
         """
-        filters = self.design.filters.model_copy(update={"table": None})
-        figures = self.design.model_copy(update={"filters": filters})
+        sections = {name: getattr(self.design, name) for name in CameraDesign.model_fields}
+        sections["filters"] = self.design.filters.model_copy(update={"table": None})
+        figures = CameraDesign.model_construct(**sections)  # no design, so it is not checked
         digest = hashlib.sha256(figures.model_dump_json(exclude={"effects"}).encode())
         if self.design.filters.table is not None:
             digest.update(self.filters.transmittance(self.design.wavelength).numpy().tobytes())

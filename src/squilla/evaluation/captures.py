@@ -69,8 +69,9 @@ def raw_figure(frame: np.ndarray, centres: np.ndarray, field: tuple[int, int]) -
 def alignment_figure(before: np.ndarray, after: np.ndarray, shape: tuple[int, int]) -> "Figure":
     """Draw the sub-images and the edges of three far units before and after alignment.
 
-    The edges of three corner units are printed over each other in cyan, magenta and yellow: where
-    they agree they make black lines, where not they fall apart into colours.
+    The edges of three units, corners where there are as many, are printed over each other in cyan,
+    magenta and yellow: where they agree they make black lines, where not they fall apart into
+    colours.
 
     Parameters
     ----------
@@ -80,6 +81,8 @@ def alignment_figure(before: np.ndarray, after: np.ndarray, shape: tuple[int, in
     """
     rows, columns = shape
     corners = [0, columns - 1, (rows - 1) * columns]
+    if min(shape) == 1:
+        corners = [0, len(before) // 2, len(before) - 1]
     ratio = before.shape[1] / before.shape[2]
     figure = sheet(2, 2, ratio, width=WIDTH * 0.8)
     for column, (title, images) in enumerate({"before": before, "after": after}.items()):
@@ -88,7 +91,7 @@ def alignment_figure(before: np.ndarray, after: np.ndarray, shape: tuple[int, in
         inks = np.stack([_edges(images[unit]) for unit in corners], -1)
         draw_picture(figure.axes[2 + column], 1 - inks, f"correlation of edges {agreement:.2f}")
     label_row(figure.axes[0], f"all {len(before)} sub-images")
-    label_row(figure.axes[2], "edges of three corner units")
+    label_row(figure.axes[2], "edges of three far units")
     return figure
 
 

@@ -293,17 +293,21 @@ def _metrics_table(trial: Trial) -> Table:
     }
     shown = [each for each in columns if any(each[0] in metrics for metrics in judged.values())]
     keys, heads, digits, best = zip(*shown, strict=True)
-    some = next(iter(judged.values()))
-    left_out = int(some["left_out"])
-    dim = f"; {left_out:,} too dim to be judged are left out" if left_out else ""
+    counts = [int(each["pixels"]) for each in judged.values()]
+    least, most = min(counts), max(counts)
+    judged_pixels, some = (
+        (f"{most:,}", "") if least == most else (f"{least:,} to {most:,}", "up to ")
+    )
+    left_out = max(int(each["left_out"]) for each in judged.values())
+    out = f"; {some}{left_out:,} too dim or without a value are left out" if left_out else ""
     if trial.labels is not None:
-        dim = f" inside the first {COLOURS} patches"
+        out = f" inside the first {COLOURS} patches"
     return Table(
         ["model", *heads],
         [(model, [each.get(key, np.nan) for key in keys]) for model, each in judged.items()],
         digits,
         best,
-        f"Agreement with the truth over {int(some['pixels']):,} pixels{dim}. MSE after division by "
+        f"Agreement with the truth over {judged_pixels} pixels{out}. MSE after division by "
         "the peak of each true spectrum; angle, goodness of fit (GFC) and structural similarity "
         "(SSIM) as means.",
     )

@@ -18,6 +18,7 @@ from squilla.files.envi import DATA_SUFFIXES, read_envi, write_envi
 from squilla.files.lazy import DIMS
 from squilla.files.notebook import CubeAccessor
 from squilla.files.tiff import open_tiff, write_tiff
+from squilla.spectra import nanometres
 
 CUBE_SUFFIXES = (".nc", ".hdr", ".tiff", ".tif", ".zarr")
 """What `save` writes and `load_cube` reads."""
@@ -52,7 +53,7 @@ def labelled(
     -------
     DataArray, (y, x, wavelength), with the CF attributes of a wavelength in nm
     """
-    coordinate = ("wavelength", np.asarray(wavelength, float), _CF)
+    coordinate = ("wavelength", nanometres(wavelength), _CF)
     return DataArray(values, {"wavelength": coordinate}, DIMS, name, dict(attributes or {}))
 
 

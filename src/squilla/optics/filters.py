@@ -235,6 +235,10 @@ class FreeRecipe:
     low_thickness: tuple[float, float] = (45.0, 255.0)
     scatter: float = 0.97
 
+    def __post_init__(self):
+        if self.filters < 1 or self.depositions < 1:
+            raise InputError("An array has one filter or more, of one layer or more.")
+
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
         """Least and greatest thickness of each layer, (L,) nm."""
@@ -326,6 +330,12 @@ class FabryPerotRecipe:
         mirror = _alternating(self.high, self.low, self.mirror)
         least, most = self.limits
         thickness = torch.tensor((*quarter, *spacer, *quarter), dtype=torch.float64)
+        if step < float(least[self.mirror + 1]):
+            raise InputError(
+                f"{self.filters} cavities of order {order} from {self.band[0]:g} to "
+                f"{self.band[1]:g} nm differ by {step:.2g} nm of spacer, less than can be "
+                "deposited; take fewer filters, a wider band or a higher order."
+            )
         return FilterArray(
             (*mirror, *[self.low] * len(spacer), *mirror),
             thickness.clamp(least, most),

@@ -224,10 +224,13 @@ def _root(covariance: Tensor) -> Tensor:
 
 
 def mean_correlation(response: Tensor) -> Tensor:
-    """Return the mean absolute correlation of different rows of a response matrix, (M, K), 0..1."""
+    """Return the mean absolute correlation of different rows of a response matrix, (M, K), 0..1.
+
+    A row without any variation correlates with none.
+    """
     rows = len(response)
-    correlation = torch.corrcoef(response).abs()
-    return (correlation.sum() - rows) / (rows * (rows - 1))
+    correlation = torch.corrcoef(response).abs().nan_to_num().fill_diagonal_(0)
+    return correlation.sum() / (rows * (rows - 1))
 
 
 def mutual_coherence(response: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from squilla.errors import InputError
 from squilla.files.disk import check_size, reading
 from squilla.files.tables import read_columns
 from squilla.optics.angle import blue_shift
-from squilla.spectra import grid
+from squilla.spectra import grid, nanometres
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +35,9 @@ class MeasuredFilters:
                 f"The filter table has the shape {self.values.shape}; with {len(self.wavelength)} "
                 f"wavelengths (filters, {len(self.wavelength)}) was expected."
             )
-        if not (np.isfinite(self.values).all() and np.isfinite(self.wavelength).all()):
+        if not np.isfinite(self.values).all():
             raise InputError("The filter table holds NaN or infinite values; repair the table.")
-        if not np.all(np.diff(self.wavelength) > 0):
-            raise InputError("The wavelengths of a filter table must increase.")
+        nanometres(self.wavelength)
         if self.effective_index is not None and not self.effective_index >= 1:
             raise InputError(
                 f"The effective index is {self.effective_index}; it must be 1 or more."
@@ -131,9 +130,7 @@ def read_table(
         values, own = read(path)
     wavelength = own if wavelength is None else np.asarray(wavelength, float)
     if wavelength is None:
-        raise InputError(
-            f"{path} names no wavelengths; pass wavelength=, one for each band, in nm."
-        )
+        raise InputError(f"{path} names no wavelengths; give them, one for each band, in nm.")
     if values.ndim == 2 and values.shape[1] != len(wavelength) == values.shape[0]:
         values = values.T
     order = np.argsort(wavelength) if values.shape[-1] == len(wavelength) else slice(None)

@@ -117,7 +117,7 @@ def _read(path: Path, calibration: Calibration) -> Reconstructor:
         raise InputError(f"{path} holds weights that are not finite; train it again.")
     model.load_state_dict(weights)
     model.provenance = provenance
-    return model.eval()
+    return model.eval().requires_grad_(False)
 
 
 def _check_camera(

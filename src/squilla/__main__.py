@@ -1,0 +1,5 @@
+"""``python -m squilla``: the command line."""
+
+from squilla.cli import main
+
+main()
