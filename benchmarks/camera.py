@@ -138,7 +138,7 @@ def restarted() -> float:
     """Return the seconds from the start of a camera that was killed to its next frame."""
     process, pipe = twin_process.start()
     with open_camera(HERE) as camera:
-        camera.read()
+        camera.read(timeout=30)
         process.kill()
         process.join()
         process, pipe = twin_process.start()  # answers already

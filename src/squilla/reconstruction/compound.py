@@ -408,7 +408,7 @@ class Compound(Reconstructor):
         if angle is not None:
             middles = self._middles().numpy()
             place = np.searchsorted((middles[1:] + middles[:-1]) / 2, angle.cpu().numpy() ** 2)
-            zone = torch.from_numpy(place).to(y.device)
+            zone = torch.as_tensor(place).to(y.device)
         return self._camera(channels, angle is not None), ratio.expand(y.shape[:-1]), zone
 
     def _pictures(
