@@ -2,8 +2,8 @@
 
     python experiments/live_picture.py camera.nc [-o docs/images/live.webp] [--model compound]
 
-Needs Chromium. The white patch is taken as white, three others are pinned, and one is selected, over
-which the scene's own spectrum is laid as a reference.
+Needs Chromium. The white patch is taken as white, three others are pinned, and one is selected,
+over which the scene's own spectrum is laid as a reference.
 """
 
 import argparse
@@ -22,11 +22,12 @@ from squilla.live.record import Recorder
 from squilla.live.source import MovingTwin
 from squilla.live.twin_frames import moved
 
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from browser import Browser
 from serving import running
+
+PICTURE = Path(__file__).parents[1] / "docs" / "images" / "live.webp"
 
 WHITE = (186, 29)
 """Row and column of the white patch."""
@@ -53,7 +54,7 @@ def references(wavelength) -> list[dict]:
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("calibration", type=Path)
-    options.add_argument("-o", "--output", type=Path, default=HERE / "docs/images/live.webp")
+    options.add_argument("-o", "--output", type=Path, default=PICTURE)
     options.add_argument("--model", default="compound")
     given = options.parse_args()
     calibration = squilla.load_calibration(given.calibration)

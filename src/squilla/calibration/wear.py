@@ -183,8 +183,9 @@ def _find_odd(image, bad, floor, shot, odd, lines):
 
 @numba.njit(cache=True, nogil=True)
 def _fill_at(image, bad, units, rows, columns):
-    for unit, row, column in zip(units, rows, columns):
-        fill_one(image[unit], bad[unit], row, column)
+    for number in range(len(units)):
+        unit = units[number]
+        fill_one(image[unit], bad[unit], rows[number], columns[number])
 
 
 def without_covered_units(views: SubImages) -> SubImages:

@@ -15,10 +15,8 @@ from torch import Tensor
 
 from squilla.reconstruction.compiled import (
     ONE,
-    add_product,
     compiled,
     inherited,
-    mix,
     over_rows,
     sigmoid,
     times,

@@ -288,23 +288,38 @@ def _besides_itself(first, last, alone, known, mixed):
 
 
 @compiled
-def _divided(score, view, zone, power):
-    for row in range(score.shape[0]):
-        for column in range(score.shape[1]):
-            cell, spread = score[row, column], power[zone[row, column]]
-            noise = view[row, column, 0] + _MODEL
-            for i in range(cell.size):
-                cell[i] /= spread[i] + noise
+def _zoned(first, last, view, zone, matrices, product):
+    """Multiply the shape of every cell by the matrix of its zone: a run of one zone at a time."""
+    width = view.shape[1]
+    shape = np.empty((width, matrices.shape[1]), np.float32)
+    for row in range(first, last):
+        start = 0
+        while start < width:
+            where, stop = zone[row, start], start
+            while stop < width and zone[row, stop] == where:
+                shape[stop] = view[row, stop, 2:]
+                stop += 1
+            np.dot(shape[start:stop], matrices[where], product[row][start:stop])
+            start = stop
 
 
-def _wiener(first: int, last: int, view, zone, vectors, power, gain, own) -> None:
-    """Write the linear estimate of `Estimators.wiener`, a few rows at a time."""
-    for start in range(first, last, _ROWS):
-        some = slice(start, min(start + _ROWS, last))
-        score = np.empty((*own[some].shape[:2], vectors.shape[-1]), np.float32)
-        _multiplied(view[some, :, 2:], vectors, zone[some], score)
-        _divided(score, view[some], zone[some], power)
-        _multiplied(score, gain, zone[some], own[some])
+@compiled
+def _wiener(first, last, view, zone, vectors, power, gain, own):
+    """Write the linear estimate of `Estimators.wiener`, as many coefficients as `own` has."""
+    score = np.empty((1, view.shape[1], vectors.shape[2]), np.float32)
+    for row in range(first, last):
+        here, places = view[row : row + 1], zone[row : row + 1]
+        _zoned(0, 1, here, places, vectors, score)
+        start = 0
+        while start < view.shape[1]:
+            where, stop = zone[row, start], start
+            while stop < view.shape[1] and zone[row, stop] == where:
+                cell, noise = score[0, stop], view[row, stop, 0] + _MODEL
+                for i in range(cell.size):
+                    cell[i] /= power[where, i] + noise
+                stop += 1
+            np.dot(score[0][start:stop], gain[where], own[row][start:stop])
+            start = stop
 
 
 @compiled
@@ -377,7 +392,7 @@ class CompiledCamera:
         clusters = len(zones[0].cluster_power)
 
         def stacked(name: str) -> np.ndarray:
-            return np.stack([getattr(zone, name).numpy() for zone in zones])
+            return np.ascontiguousarray(np.stack([getattr(zone, name) for zone in zones]))
 
         self.channels = np.float32(camera.channels)
         self.project = camera.project.numpy()
@@ -482,7 +497,7 @@ def gather_evidence(
     coefficients = empty(SPECTRAL, basis)
     variance, features = np.empty_like(coefficients), empty(SPECTRAL, 2)
     place, scores = places[SPECTRAL], empty(SPECTRAL, camera.scores.shape[-1])
-    run(_times_zoned, len(spectral), spectral[..., 2:], camera.scores, place, scores)
+    run(_zoned, len(spectral), spectral, place, camera.scores, scores)
     run(
         _mixture, len(spectral), scores, spectral,
         place, *camera.mixture, coefficients, variance, features,
@@ -523,20 +538,6 @@ def _zones(zone: np.ndarray | None, sides: tuple[int, ...], level: int) -> np.nd
 def times(first: int, last: int, picture: np.ndarray, matrix: np.ndarray, product: np.ndarray):
     """Multiply every cell of some rows by a matrix."""
     np.matmul(picture[first:last], matrix, out=product[first:last])
-
-
-def _times_zoned(first: int, last: int, picture, matrices, zone, product) -> None:
-    """Multiply every cell of some rows by the matrix of its zone."""
-    _multiplied(picture[first:last], matrices, zone[first:last], product[first:last])
-
-
-def _multiplied(picture, matrices, zone, product) -> None:
-    if len(matrices) == 1:
-        np.matmul(picture, matrices[0], out=product)
-        return
-    for number in np.unique(zone):
-        cells = zone == number
-        product[cells] = picture[cells] @ matrices[number]
 
 
 def over_rows(kernel: Callable[..., None], rows: int, threads: int, *arguments) -> None:
