@@ -183,6 +183,7 @@ class _Picture(nn.Module):
     def forward(self, y: Tensor) -> Tensor:
         x = self.network.spread(y)[None, None]
         for layer in self.network.layers:
+            assert isinstance(layer, nn.Conv1d)
             x = relu(conv2d(x, layer.weight[:, :, None], layer.bias, padding=(0, 1)))
         x = x.permute(0, 2, 3, 1)[0].flatten(1)
         return torch.sigmoid(linear(x, self.gather, self.network.gather.bias))
