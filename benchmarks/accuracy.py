@@ -1,6 +1,7 @@
 """How far every reconstructor is from the truth, in one table.
 
     python benchmarks/accuracy.py [--weights FILE] [--networks FOLDER] [--quick]
+    python benchmarks/accuracy.py --render      # only the table of docs/compound.md
 
 Every row is a scene before a simulated camera, y = R x + noise; no row has a spectrum, a scene or a
 random array that any method was trained on. The networks that know one camera stand only in that
@@ -31,7 +32,8 @@ from squilla.camera.scenes import load_scene
 from squilla.evaluation.metrics import DARKEST, evaluate
 from squilla.optics.filters import StencilRecipe
 from squilla.reconstruction.compound import Compound
-from squilla.reconstruction.reconstructor import Reconstructor, load_model
+from squilla.reconstruction.models import load_model
+from squilla.reconstruction.reconstructor import Reconstructor
 from squilla.spectra import grid
 from squilla.training.compound import misaligned
 from squilla.training.noise import add_noise
@@ -39,6 +41,7 @@ from squilla.training.scenes import Palette, draw_scenes
 
 RESULTS = Path(__file__).parents[1] / "experiments" / "results" / "accuracy.json"
 WAVELENGTH = grid()
+PAGE = Path(__file__).parents[1] / "docs" / "compound.md"
 SAMPLE = 3000
 PICTURES = ("indian-pines", "corn-kernel")
 ANGLES = np.radians([0.0, 4.64, 6.57, 8.04, 9.29])
@@ -297,13 +300,46 @@ def mtf50(picture: np.ndarray, distance: np.ndarray) -> float:
     return 4 * first / 4096
 
 
+def render() -> None:
+    """Write the table of docs/compound.md; the unseen arrays are one row."""
+    rows = json.loads(RESULTS.read_text())["rows"]
+    many = [row for row in rows if row["row"].startswith("unseen array ")]
+    mean = {
+        name: {key: float(np.mean([row[name][key] for row in many])) for key in many[0][name]}
+        for name in many[0] if isinstance(many[0][name], dict)
+    }  # fmt: skip
+    at = rows.index(many[0])
+    few = [row for row in rows if row not in many]
+    few.insert(at, {"row": "ten unseen arrays, chart 20 dB, mean", **mean})
+    own = [name for name in rows[0] if name.endswith("_0")]  # cells of table 5.1
+    names = {"ridge": "ridge", "sparse": "sparse", "mlp": "mlp"}
+    names |= {name: name.split("_")[0] for name in own} | {"compound": "compound"}
+    heads = [f"*{head}*" if name in own else head for name, head in names.items()]
+    lines = [["row", *heads, "SAM", "PSNR", "cover"], ["---"] * (len(names) + 4)]
+    for row in few:
+        best = min(row[name]["mse"] for name in names if name in row)
+        errors = [f"{row[name]['mse']:.5f}" if name in row else "" for name in names]
+        errors = [f"**{each}**" if each == f"{best:.5f}" else each for each in errors]
+        told = row["compound"]
+        rest = [f"{told['sam_deg']:.1f}", f"{told['psnr_db']:.1f}", f"{told['cover']:.0%}"]
+        lines.append([row["row"], *errors, *rest])
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    before, rest = PAGE.read_text().split("<!-- begin accuracy -->\n")
+    after = rest.split("<!-- end accuracy -->")[1]
+    PAGE.write_text(f"{before}<!-- begin accuracy -->\n{table}\n<!-- end accuracy -->{after}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="The table of accuracy.")
+    parser.add_argument("--render", action="store_true", help="only write the table of the docs")
     parser.add_argument("--weights", type=Path, help="compound weights; default: those that ship")
     parser.add_argument("--networks", type=Path, help="folder of models of the trained camera")
     parser.add_argument("--quick", action="store_true", help="two unseen arrays instead of ten")
     parser.add_argument("--only", help="rows whose name holds this text")
     options = parser.parse_args()
+    if options.render:
+        render()
+        return
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1)))
     networks = sorted(options.networks.glob("*.safetensors")) if options.networks else []
     names = ("ridge", "sparse", "mlp", *(path.stem for path in networks), "compound")
@@ -328,6 +364,7 @@ def main() -> None:
     if not options.only:
         story = {"peaks and edges": proofs, "machine": platform.machine(), "rows": rows}
         RESULTS.write_text(json.dumps(story, indent=1) + "\n")
+        render()
 
 
 if __name__ == "__main__":

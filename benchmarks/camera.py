@@ -136,20 +136,15 @@ def lossy(seconds: float = 60.0) -> dict[str, float]:
 
 def restarted() -> float:
     """Return the seconds from the start of a camera that was killed to its next frame."""
-    process, pipe = twin_process.start()
-    with open_camera(HERE) as camera:
+    with twin_process.started() as process, open_camera(HERE) as camera:
         camera.read(timeout=30)
         process.kill()
         process.join()
-        process, pipe = twin_process.start()  # answers already
-        begin = time.monotonic()
-        while camera.statistics.reconnected == 0:
-            camera.read()
-        seconds = time.monotonic() - begin
-    process.kill()
-    process.join()
-    pipe.close()
-    return seconds
+        with twin_process.started():  # answers already
+            begin = time.monotonic()
+            while camera.statistics.reconnected == 0:
+                camera.read()
+            return time.monotonic() - begin
 
 
 def faults() -> dict:

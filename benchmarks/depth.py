@@ -38,7 +38,7 @@ from squilla.camera.solid import solid_scene
 from squilla.camera.twin import Camera
 from squilla.files.cube import labelled
 from squilla.reconstruction.linear import complete
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 from squilla.spectra import CHART_LIGHT, lights, reflectances
 
 RESULTS = Path(__file__).parent.parent / "experiments" / "results" / "depth.json"
@@ -89,7 +89,7 @@ class Take:
 
     def raws(self, snr: float):
         """Return the noisy frame of the scene and of its plane."""
-        exposure = self.camera.sensor.exposure_for(self.camera._fields(self.rate), snr)
+        exposure = self.camera.sensor.exposure_for(self.camera.fields(self.rate), snr)
         return [
             self.camera.expose(rate, exposure, torch.Generator().manual_seed(2 * self.seed + k))
             for k, rate in enumerate((self.rate, self.plane_rate))
@@ -398,11 +398,7 @@ def main() -> None:
     if given.calibration:
         calibration = squilla.load_calibration(given.calibration)
     else:
-        rehearsal = Rehearsal(camera, step=5.0, bandwidth=5.0)
-        calibration = squilla.calibrate(
-            camera.design, dark=rehearsal.dark(), flat=rehearsal.flat(), sweep=rehearsal.sweep(),
-            target=rehearsal.target(), target_distance=rehearsal.distance,
-        )  # fmt: skip
+        calibration = Rehearsal(camera, step=5.0, bandwidth=5.0).calibrate()
     scenes = {f"doll {seed}": (solid_scene, {"seed": seed}) for seed in (11,)}
     scenes |= {f"layers {seed}": (layers_scene, {"seed": seed}) for seed in (11, 12)}
     cells = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}

@@ -16,8 +16,9 @@ from sklearn.linear_model import Lasso
 from timing import seconds
 
 from squilla.calibration.calibration import Calibration
+from squilla.priors import broad_spectra
 from squilla.reconstruction.sparse import Sparse, two_step
-from squilla.spectra import broad_spectra, grid
+from squilla.spectra import grid
 from squilla.training.noise import add_noise
 
 SIDE = 250

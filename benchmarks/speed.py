@@ -30,7 +30,7 @@ from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
 from squilla.camera.scenes import load_scene
 from squilla.optics.filters import StencilRecipe
-from squilla.reconstruction.reconstructor import load_model, model_class
+from squilla.reconstruction.models import load_model, model_class
 from squilla.spectra import grid
 from squilla.training.noise import add_noise
 

@@ -14,7 +14,7 @@ from timing import seconds
 import squilla
 from squilla.calibration.rehearsal import Rehearsal
 from squilla.camera.scenes import load_scene
-from squilla.reconstruction.reconstructor import model_class
+from squilla.reconstruction.models import model_class
 
 
 def peak() -> float:
@@ -39,15 +39,7 @@ def main() -> None:
     }
     for name, call in rows.items():
         print(f"| {name} | {seconds(call):.2f} | {peak():.2f} |")
-    rehearsal = Rehearsal(camera, frames=2, step=25.0, bandwidth=25.0)
-    calibration = squilla.calibrate(
-        camera.design,
-        dark=rehearsal.dark(),
-        flat=rehearsal.flat(),
-        sweep=rehearsal.sweep(),
-        target=rehearsal.target(),
-        target_distance=rehearsal.distance,
-    )
+    calibration = Rehearsal(camera, frames=2, step=25.0, bandwidth=25.0).calibrate()
     measurement = squilla.measure(raw, calibration)
     rows = {"measure: raw frame to measurement": lambda: squilla.measure(raw, calibration)}
     for name in ("ridge", "sparse", "mlp"):

@@ -8,7 +8,8 @@ import numpy as np
 
 import squilla as sq
 from squilla.calibration.rehearsal import ideal_calibration
-from squilla.spectra import CHART_LIGHT, chart_reflectances, grid, lights, tristimulus
+from squilla.colour import tristimulus
+from squilla.spectra import CHART_LIGHT, chart_reflectances, grid, lights
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 wavelength = grid(500, 750, 1)

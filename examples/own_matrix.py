@@ -4,8 +4,9 @@ import torch
 
 import squilla as sq
 from squilla.optics.filters import StencilRecipe
+from squilla.priors import natural_spectra
 from squilla.reconstruction.linear import Ridge
-from squilla.spectra import grid, natural_spectra
+from squilla.spectra import grid
 
 wavelength = grid(500, 750, 1)
 R = StencilRecipe().draw(3).transmittance(wavelength).numpy()  # (M, K); yours here

@@ -89,10 +89,7 @@ def main() -> None:
 
     print_out = poster(350, wavelength, seed=1)
     shots = [capture(print_out, *shot, 35, n)[0] for n, shot in enumerate(SHOTS)]
-    calibration = squilla.calibrate(
-        camera.design, dark=rehearsal.dark(), flat=rehearsal.flat(), sweep=rehearsal.sweep(),
-        shots=shots,
-    )  # fmt: skip
+    calibration = rehearsal.calibrate(target=None, target_distance=None, shots=shots)
     lattice = calibration.lattice
     assert lattice is not None
     true = camera.design.centres

@@ -30,8 +30,9 @@ from squilla.evaluation.style import COLOURS, INK, canvas, styled
 from squilla.files.cube import labelled
 from squilla.optics.angle import fit_effective_index
 from squilla.optics.merit import Prior, WhiteNoise, estimator_error, wiener
-from squilla.reconstruction.reconstructor import load_model
-from squilla.spectra import CHART_LIGHT, PRIORS, chart_reflectances, lights
+from squilla.priors import PRIORS
+from squilla.reconstruction.models import load_model
+from squilla.spectra import CHART_LIGHT, chart_reflectances, lights
 from squilla.training.noise import add_noise
 
 HERE = Path(__file__).parent
@@ -211,7 +212,7 @@ def frames(camera: squilla.Camera, learnt: Calibration) -> dict:
         for wanted in SNRS:
             snr = min(wanted, 32.0)  # one exposure of this scene reaches no more
             count = round(10 ** ((wanted - snr) / 10))
-            exposure = twin.sensor.exposure_for(twin._fields(rate), snr)
+            exposure = twin.sensor.exposure_for(twin.fields(rate), snr)
             y = 0.0
             for number in range(count):
                 raw = twin.expose(rate, exposure, torch.Generator().manual_seed(50 + number))

@@ -30,12 +30,14 @@ from squilla.calibration.views import sub_images
 from squilla.camera.design import CameraDesign, designs
 from squilla.camera.scenes import chart_layout, load_scene
 from squilla.camera.twin import Camera
+from squilla.colour import rgb
 from squilla.evaluation.chart import inner
 from squilla.evaluation.metrics import evaluate
 from squilla.files.cube import labelled
 from squilla.files.raw import Raw
-from squilla.reconstruction.reconstructor import load_model
-from squilla.spectra import CHART_LIGHT, chart_reflectances, gaussian_mixtures, lights, rgb
+from squilla.priors import gaussian_mixtures
+from squilla.reconstruction.models import load_model
+from squilla.spectra import CHART_LIGHT, chart_reflectances, lights
 
 RESULTS = Path(__file__).parent / "results" / "cameras"
 FIGURE = Path(__file__).parent.parent / "docs" / "images" / "cameras.webp"

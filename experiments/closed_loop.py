@@ -23,15 +23,7 @@ def rms(values) -> float:
 
 def main() -> None:
     camera = squilla.Camera("thesis")
-    rehearsal = Rehearsal(camera, step=5.0, bandwidth=5.0)
-    calibration = squilla.calibrate(
-        camera.design,
-        dark=rehearsal.dark(),
-        flat=rehearsal.flat(),
-        sweep=rehearsal.sweep(),
-        target=rehearsal.target(),
-        target_distance=rehearsal.distance,
-    )
+    calibration = Rehearsal(camera, step=5.0, bandwidth=5.0).calibrate()
     lattice, pixels = calibration.lattice, calibration.pixels
     assert lattice is not None
     assert pixels is not None

@@ -16,12 +16,13 @@ import torch
 from machine import processor
 
 from squilla.camera.scenes import chart_layout, load_scene
+from squilla.colour import composite
 from squilla.demo import MODELS, demo
 from squilla.evaluation.chart import patch_errors, patch_means
 from squilla.evaluation.style import COLOURS, INK, canvas, styled
 from squilla.files.cube import load_cube
 from squilla.files.raw import read_raw
-from squilla.spectra import CHART_LIGHT, chart_reflectances, composite, lights
+from squilla.spectra import CHART_LIGHT, chart_reflectances, lights
 
 HERE = Path(__file__).parent
 PICTURE = HERE.parent / "docs" / "images" / "demo.webp"

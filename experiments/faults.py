@@ -21,7 +21,6 @@ from torch import Tensor
 from xarray import DataArray
 
 from squilla.calibration.alignment import measure
-from squilla.calibration.calibrate import calibrate
 from squilla.calibration.calibration import Calibration
 from squilla.calibration.rehearsal import Rehearsal, poster
 from squilla.camera import lens
@@ -32,8 +31,8 @@ from squilla.evaluation.chart import inner
 from squilla.evaluation.metrics import evaluate
 from squilla.files.raw import Raw
 from squilla.optics.merit import Prior, WhiteNoise, wiener
-from squilla.reconstruction.reconstructor import load_model
-from squilla.spectra import natural_spectra
+from squilla.priors import natural_spectra
+from squilla.reconstruction.models import load_model
 
 RESULTS = Path(__file__).parent / "results" / "faults.json"
 
@@ -139,15 +138,7 @@ def in_numbers(kind: str) -> dict:
 
 def learnt(camera: Camera) -> Calibration:
     step = camera.design.band.step
-    rehearsal = Rehearsal(camera, step=step, bandwidth=step, frames=4)
-    return calibrate(
-        camera.design,
-        dark=rehearsal.dark(),
-        flat=rehearsal.flat(),
-        sweep=rehearsal.sweep(),
-        target=rehearsal.target(),
-        target_distance=rehearsal.distance,
-    )
+    return Rehearsal(camera, step=step, bandwidth=step, frames=4).calibrate()
 
 
 def with_frames(camera: Camera, own: Calibration, sound: Calibration) -> dict:
@@ -196,10 +187,10 @@ def ghosts() -> dict:
     field, beside = (opened.rate(each, distance=2000.0) for each in (scene, lamp))
     hemisphere = opened.flat_rate(np.ones(len(wavelength)))
     own = sound.flat_rate(np.ones(len(wavelength)))
-    signal, in_fields = (float(sound._fields(rate).mean()) for rate in (field, beside))
-    exposure = sound.sensor.exposure_for(sound._fields(field), 20.0)
+    signal, in_fields = (float(sound.fields(rate).mean()) for rate in (field, beside))
+    exposure = sound.sensor.exposure_for(sound.fields(field), 20.0)
     found = {
-        "hemisphere": {"ghost": float((sound._fields(hemisphere) / sound._fields(own)).mean() - 1)}
+        "hemisphere": {"ghost": float((sound.fields(hemisphere) / sound.fields(own)).mean() - 1)}
     }
     for share in (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3):
         rate = field + share * signal / in_fields * beside

@@ -32,6 +32,7 @@ from xarray import DataArray
 
 import squilla
 from squilla.camera.scenes import chart_layout
+from squilla.colour import composite
 from squilla.evaluation.chart import COLOURS as PATCHES
 from squilla.evaluation.chart import patch_means
 from squilla.evaluation.plots import band_figure
@@ -45,7 +46,7 @@ from squilla.evaluation.style import (
     sheet,
     styled,
 )
-from squilla.spectra import CHART_LIGHT, chart_reflectances, composite, grid, lights
+from squilla.spectra import CHART_LIGHT, chart_reflectances, grid, lights
 
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
 ROWS = ("none", "20", "15:20")

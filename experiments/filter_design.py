@@ -38,7 +38,8 @@ from squilla.optics.merit import (
 from squilla.optics.plots import plot_search, plot_tolerance
 from squilla.optics.tables import band_pass
 from squilla.optics.tolerance import ProcessErrors, tolerance
-from squilla.spectra import CHART_LIGHT, grid, lights, reflectances, scaled
+from squilla.priors import scaled
+from squilla.spectra import CHART_LIGHT, grid, lights, reflectances
 
 SEED = 0
 BAND = grid(step=2.0)

@@ -25,7 +25,7 @@ from squilla.camera.scenes import chart_layout, load_scene
 from squilla.camera.twin import Camera
 from squilla.evaluation.chart import inner
 from squilla.evaluation.metrics import evaluate
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 RESULTS = Path(__file__).parent / "results" / "lens_colour.json"
 DISTANCE = 300.0
@@ -82,7 +82,7 @@ def main() -> None:
         near = (labels >= 0) & (inner(labels, 3) < 0)  # the outermost 3 px of each patch
         rate = camera.rate(scene, distance=DISTANCE)
         for snr in (20.0, 30.0, 34.0):
-            exposure = camera.sensor.exposure_for(camera._fields(rate), snr)
+            exposure = camera.sensor.exposure_for(camera.fields(rate), snr)
             raw = camera.expose(rate, exposure, torch.Generator().manual_seed(1))
             measurement = measure(raw, calibration, distance=DISTANCE)
             noise = 10 ** (-snr / 10) * 30  # detail holds a small part of the power

@@ -25,7 +25,7 @@ from squilla.calibration.rehearsal import ideal_calibration
 from squilla.camera.design import CameraDesign
 from squilla.camera.twin import Camera
 from squilla.optics.merit import Noise, PhotonNoise, Prior, WhiteNoise, wiener
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 from squilla.spectra import CHART_LIGHT, chart_reflectances, grid, lights
 
 RESULTS = Path(__file__).parent / "results" / "limits.json"

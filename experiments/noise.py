@@ -37,7 +37,7 @@ def main() -> None:
     scene = load_scene("chart", design.wavelength, design.field.size)
     calibration = ideal_calibration(camera)
     rate = camera.rate(scene)
-    usual = camera.sensor.exposure_for(camera._fields(rate), 20.0)
+    usual = camera.sensor.exposure_for(camera.fields(rate), 20.0)
 
     mean, variance = [], []
     for factor in EXPOSURES:
@@ -93,7 +93,7 @@ def transfer(first: np.ndarray, second: np.ndarray, bins: int = 24) -> tuple:
 
 def ratio_of(camera: Camera, rate: np.ndarray, exposure: float) -> float:
     """Return the ratio of the whole picture at an exposure by the law of the sensor, dB."""
-    fields = np.asarray(camera._fields(rate), float)
+    fields = np.asarray(camera.fields(rate), float)
     sensor = camera.design.sensor
     signal = np.mean(fields**2) * exposure**2
     noise = fields.mean() * exposure + sensor.read_noise**2 + sensor.gain**2 / 12

@@ -20,8 +20,9 @@ import torch
 
 import squilla
 from squilla.calibration.rehearsal import LAMPS, Rehearsal
-from squilla.reconstruction.reconstructor import load_model
-from squilla.spectra import CHART_LIGHT, chart_reflectances, lights, natural_spectra
+from squilla.priors import natural_spectra
+from squilla.reconstruction.models import load_model
+from squilla.spectra import CHART_LIGHT, chart_reflectances, lights
 from squilla.training.noise import add_noise
 
 RESULTS = Path(__file__).parent / "results" / "sensitivity.json"
@@ -123,23 +124,15 @@ def learn(camera: squilla.Camera, case) -> squilla.Calibration:
     lessons: dict = {}
     if callable(change):
         change(rehearsal)
-        lessons["sweep"] = rehearsal.sweep()
         if case is CASES["saturated and misread step *"]:
-            lessons["sweep"] = spoilt(lessons["sweep"], camera)
+            lessons["sweep"] = spoilt(rehearsal.sweep(), camera)
     else:
         wavelength, table = camera.design.wavelength, lights()
         lamps = [table.one(name, wavelength) for name in LAMPS]
         if change:
             lamps += [np.exp(-4 * np.log(2) * ((wavelength - c) / w) ** 2) for c, w in LEDS]
-        lessons["known"] = rehearsal.known(np.array(lamps))
-    return squilla.calibrate(
-        camera.design,
-        dark=rehearsal.dark(),
-        flat=rehearsal.flat(),
-        target=rehearsal.target(),
-        target_distance=rehearsal.distance,
-        **lessons,
-    )
+        lessons |= {"sweep": None, "known": rehearsal.known(np.array(lamps))}
+    return rehearsal.calibrate(**lessons)
 
 
 # --- the verdict ------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from torch import Tensor
 
 import squilla
 from squilla.calibration.calibration import Calibration
-from squilla.reconstruction.reconstructor import model_class
+from squilla.reconstruction.models import model_class
 
 CELLS = RESULTS / "table_5_2"
 IMAGE = 250 * 250

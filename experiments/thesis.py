@@ -55,15 +55,7 @@ def camera() -> Calibration:
     if not path.exists():
         WORK.mkdir(exist_ok=True)
         rehearsal = Rehearsal(squilla.Camera("thesis"), step=5.0, bandwidth=5.0)
-        learnt = squilla.calibrate(
-            rehearsal.camera.design,
-            dark=rehearsal.dark(),
-            flat=rehearsal.flat(),
-            sweep=rehearsal.sweep(),
-            target=rehearsal.target(),
-            target_distance=rehearsal.distance,
-        )
-        learnt.save(path)
+        rehearsal.calibrate().save(path)
     return squilla.load_calibration(path)
 
 

@@ -15,8 +15,8 @@ import torch
 
 import squilla
 from squilla.cli.train import parse_noise
+from squilla.priors import PRIORS
 from squilla.reconstruction.linear import Ridge
-from squilla.spectra import PRIORS
 from squilla.training.noise import add_noise
 
 WEIGHTS = Path(squilla.__file__).parent / "data" / "weights" / "mlp.safetensors"

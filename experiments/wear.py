@@ -29,7 +29,7 @@ from squilla.camera.scenes import load_scene
 from squilla.camera.twin import Camera
 from squilla.camera.wear import Dust, Wear, WornCamera, drop_rows
 from squilla.reconstruction.judgement import judge, told_of
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 RESULTS = Path(__file__).parent / "results" / "wear.json"
 PAGE = Path(__file__).parents[1] / "docs" / "wear.md"
@@ -76,7 +76,7 @@ def of(kind: str, wear: Wear) -> dict:
     camera = WornCamera("thesis", wear)
     scene = load_scene("corn-kernel", camera.design.wavelength, camera.design.field.size)
     sound = Camera("thesis")
-    exposure = sound.sensor.exposure_for(sound._fields(sound.rate(scene)), SNR)
+    exposure = sound.sensor.exposure_for(sound.fields(sound.rate(scene)), SNR)
     raw = camera.expose(camera.rate(scene), exposure, torch.Generator().manual_seed(3))
     if "rows" in kind:
         raw = drop_rows(raw, 1270, 80, repeated="stale" in kind)

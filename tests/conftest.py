@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from squilla.calibration.calibrate import calibrate
 from squilla.calibration.rehearsal import Rehearsal, poster
 from squilla.camera.design import CameraDesign
 from squilla.camera.twin import Camera
@@ -39,15 +38,7 @@ def camera(design) -> Camera:
 @pytest.fixture(scope="session")
 def calibration(camera):
     """Learnt from frames alone."""
-    rehearsal = Rehearsal(camera, step=5.0, bandwidth=5.0, distance=300.0)
-    return calibrate(
-        camera.design,
-        dark=rehearsal.dark(),
-        flat=rehearsal.flat(),
-        sweep=rehearsal.sweep(),
-        target=rehearsal.target(),
-        target_distance=300.0,
-    )
+    return Rehearsal(camera, step=5.0, bandwidth=5.0, distance=300.0).calibrate()
 
 
 @pytest.fixture(scope="session")

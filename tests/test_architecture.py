@@ -11,8 +11,8 @@ import squilla
 
 SOURCE = Path(squilla.__file__).parent
 ORDER = (
-    "errors", "threads", "spectra", "files", "optics", "camera", "calibration", "reconstruction",
-    "training", "evaluation", "live", "batch", "demo", "cli",
+    "errors", "threads", "spectra", "priors", "colour", "files", "optics", "camera", "calibration",
+    "reconstruction", "training", "evaluation", "live", "batch", "demo", "cli",
 )  # fmt: skip
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init__.py")
 

@@ -15,7 +15,7 @@ import tifffile
 import torch
 import xarray as xr
 
-from squilla.batch import Recipe, reconstruct_all
+from squilla.batch.captures import Recipe, reconstruct_all
 from squilla.errors import InputError
 from squilla.files.cube import load_cube
 from squilla.files.raw import list_frames, read_raw, write_raw
@@ -55,7 +55,7 @@ def serial(night, tmp_path_factory):
 def test_each_capture_is_its_own_cube_in_the_stack(night, serial):
     from squilla.calibration.alignment import measure
     from squilla.calibration.store import load_calibration
-    from squilla.reconstruction.reconstructor import load_model
+    from squilla.reconstruction.models import load_model
 
     output, summary = serial
     assert len(summary.done) == 5
@@ -167,7 +167,7 @@ def test_pages_of_a_tiff_are_captures(night, tmp_path):
 
 def run_in_background(night, output) -> subprocess.Popen:
     code = (
-        "import sys; from pathlib import Path; from squilla.batch import *; "
+        "import sys; from pathlib import Path; from squilla.batch.captures import *; "
         "from squilla.files.raw import list_frames\n"
         "if __name__ == '__main__': reconstruct_all(list_frames(Path(sys.argv[1]) / 'raw'), "
         "Recipe(Path(sys.argv[1]) / 'camera.nc', distance=300.0), Path(sys.argv[2]), workers=2)"

@@ -57,9 +57,9 @@ def test_noise_is_found(calibration, design):
 
 def test_the_response_of_every_pixel_is_found(camera, calibration):
     """What is left of the planted PRNU, 0.5 %, is the noise of eight flats."""
-    response = camera._fields(camera.sensor.response)
+    response = camera.fields(camera.sensor.response)
     assert response.std() == pytest.approx(0.005, rel=0.05)
-    found = camera._fields(calibration.pixels.flat)
+    found = camera.fields(calibration.pixels.flat)
     assert np.corrcoef(found.ravel(), response.ravel())[0, 1] > 0.4
 
 
@@ -91,15 +91,7 @@ def test_measurement_explains_the_scene():
         | {"field_angle": True, "cone": True, "vignetting": True, "shot_noise": True},
     )
     camera = Camera(design)
-    rehearsal = Rehearsal(camera, step=2.5, bandwidth=2.5, frames=2)
-    learnt = calibrate(
-        design,
-        dark=rehearsal.dark(),
-        flat=rehearsal.flat(),
-        sweep=rehearsal.sweep(),
-        target=rehearsal.target(),
-        target_distance=300.0,
-    )
+    learnt = Rehearsal(camera, step=2.5, bandwidth=2.5, frames=2).calibrate()
     light = 0.2 + 0.6 * np.exp(-((design.wavelength - 610) ** 2) / 2 / 60**2)
     shade = 0.5 + 0.3 * np.sin(np.linspace(0, 9, 90))[:, None, None]
     scene = poster(90, design.wavelength)
@@ -128,20 +120,14 @@ def test_a_saturated_step_is_left_out(camera):
     bright = camera.flat_rate(np.ones(len(camera.design.wavelength)))
     sweep[20] = replace(sweep[20], raw=camera.expose(bright, sweep[20].raw.exposure))
 
-    def learn(steps):
-        return calibrate(
-            camera.design, dark=rehearsal.dark(), flat=rehearsal.flat(), sweep=steps,
-            target=rehearsal.target(), target_distance=300.0,
-        )  # fmt: skip
-
-    learnt = learn(sweep)
+    learnt = rehearsal.calibrate(sweep=sweep)
     assert learnt.provenance["saturated_steps"] == f"{sweep[20].wavelength:g} nm"
     truth = camera.sensitivity(learnt.angle)
     assert rms(learnt.sensitivity - truth) / rms(truth) < 0.01
     for number in range(10, 18):
         sweep[number] = replace(sweep[number], raw=sweep[20].raw)
     with pytest.raises(InputError, match="saturated"):
-        learn(sweep)
+        rehearsal.calibrate(sweep=sweep)
 
 
 def test_either_a_sweep_or_known_scenes(design):
@@ -396,17 +382,12 @@ def test_frames_that_do_not_belong_together_are_refused(design, part, says):
     elif part != "none":
         sweep[1] = replace(sweep[1], **{part: np.nan if part == "wavelength" else -1.0})
 
-    def learn(target):
-        return calibrate(
-            design, dark=rehearsal.dark(), flat=flat, sweep=sweep, target=target,
-            target_distance=None if target is None else 300.0,
-        )  # fmt: skip
-
     if says is None:
-        assert "target_score" not in learn(None).provenance
+        learnt = rehearsal.calibrate(flat=flat, sweep=sweep, target=None, target_distance=None)
+        assert "target_score" not in learnt.provenance
         return
     with pytest.raises(InputError, match=says):
-        learn(target)
+        rehearsal.calibrate(flat=flat, sweep=sweep, target=target)
 
 
 def test_photon_transfer_finds_gain_and_read_noise():
@@ -433,15 +414,7 @@ def test_darks_of_two_exposures_give_the_rate():
 def test_the_whole_camera_at_full_size():
     """The thesis' camera, 12 MP and 36 units: centres, R and alignment from frames alone."""
     camera = Camera(CameraDesign.load("thesis"))
-    rehearsal = Rehearsal(camera, step=5.0, bandwidth=5.0)
-    learnt = calibrate(
-        camera.design,
-        dark=rehearsal.dark(),
-        flat=rehearsal.flat(),
-        sweep=rehearsal.sweep(),
-        target=rehearsal.target(),
-        target_distance=300.0,
-    )
+    learnt = Rehearsal(camera, step=5.0, bandwidth=5.0).calibrate()
     assert rms(learnt.lattice.centre - camera.design.centres) < 0.1
     truth = camera.sensitivity(learnt.angle)
     assert rms(learnt.sensitivity - truth) / rms(truth) < 0.01

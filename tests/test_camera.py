@@ -144,7 +144,7 @@ def test_parallax_is_pitch_times_focal_over_distance(design, distance):
 def test_a_plane_depth_map_is_the_plane(camera, scene):
     plane = camera.rate(scene, distance=250.0)
     relief = camera.rate(scene, depth=np.full(scene.shape[:2], 250.0))
-    inner = camera._fields(relief) - camera._fields(plane)
+    inner = camera.fields(relief) - camera.fields(plane)
     assert np.sqrt((inner**2).mean()) < 0.01 * plane.max()
 
 
@@ -201,14 +201,12 @@ def test_snr_is_what_was_asked_for(camera, scene, snr):
     generator = torch.Generator().manual_seed(1)
     frames = [camera.capture(scene, snr=snr, generator=generator) for _ in range(2)]
     one, other = (
-        camera._fields(raw.frame.astype(float) - camera.design.sensor.black_level) for raw in frames
+        camera.fields(raw.frame.astype(float) - camera.design.sensor.black_level) for raw in frames
     )
     noise = (one - other).std() / np.sqrt(2)
     signal = np.sqrt(np.mean(one * other))
     assert 20 * np.log10(signal / noise) == pytest.approx(snr, abs=0.2)
-    assert frames[0].exposure == pytest.approx(
-        camera.sensor.exposure_for(camera._fields(rate), snr)
-    )
+    assert frames[0].exposure == pytest.approx(camera.sensor.exposure_for(camera.fields(rate), snr))
 
 
 def test_variance_grows_with_the_mean_by_the_gain(camera):

@@ -11,11 +11,12 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
+from squilla.calibration.lessons import read_known, read_sweep
 from squilla.camera.design import design_path
 from squilla.cli.app import app
-from squilla.cli.steps import read_depth, read_known, read_sweep
 from squilla.errors import InputError
 from squilla.files.cube import load_cube
+from squilla.files.depth import read_depth
 
 SMALL = {
     "rows = 6 ": "rows = 4 ", "columns = 6 ": "columns = 4 ", "rows = 3000": "rows = 480",

@@ -8,6 +8,7 @@ from scipy.stats import multivariate_normal, norm
 from random_camera import smooth_camera
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
+from squilla.priors import natural_spectra
 from squilla.reconstruction.compound import Compound
 from squilla.reconstruction.evidence import (
     TOLD,
@@ -19,9 +20,9 @@ from squilla.reconstruction.evidence import (
     kinship,
     noise_factor,
 )
+from squilla.reconstruction.models import load_model
 from squilla.reconstruction.prior import Estimators, Prior, broad_prior, fit_mixture
-from squilla.reconstruction.reconstructor import load_model
-from squilla.spectra import CHART_LIGHT, grid, lights, natural_spectra
+from squilla.spectra import CHART_LIGHT, grid, lights
 from squilla.training.compound import Recipe, Studio, misaligned, train_compound
 from squilla.training.noise import add_noise
 from squilla.training.scenes import Palette, draw_scenes

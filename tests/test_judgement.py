@@ -13,7 +13,7 @@ from squilla.cli.app import app
 from squilla.files.cube import labelled, open_cube
 from squilla.files.raw import Raw, write_raw
 from squilla.reconstruction.judgement import Doubt, judge, told_of
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 
 @pytest.fixture(scope="module")

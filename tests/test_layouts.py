@@ -12,7 +12,7 @@ from squilla.calibration.single_lens import demosaick, measure_mosaic, measure_s
 from squilla.camera.design import CameraDesign, designs
 from squilla.camera.twin import Camera
 from squilla.errors import InputError
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 TILE = np.array([[3, 1, 4], [0, 5, 2]])
 

@@ -9,8 +9,8 @@ import torch
 from random_camera import smooth_camera
 from squilla.calibration.agreement import model_error
 from squilla.calibration.calibration import Calibration
+from squilla.priors import broad_spectra, second_moment
 from squilla.reconstruction.linear import Ridge, complete
-from squilla.spectra import broad_spectra, second_moment
 
 
 @pytest.fixture(scope="module")

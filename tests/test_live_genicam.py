@@ -19,7 +19,7 @@ from squilla.live.pipeline import LiveSource
 from squilla.live.source import open_source
 from squilla.live.twin_camera import TwinCamera
 from squilla.live.twin_frames import TwinFrames
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 from twin_process import installed
 
 HERE = "genicam:127.0.0.1"

@@ -16,6 +16,7 @@ from conftest import small_design
 from serving import Line, running
 from squilla.calibration.alignment import measure
 from squilla.camera.twin import Camera
+from squilla.colour import rgb_weights
 from squilla.errors import InputError
 from squilla.evaluation.metrics import sam
 from squilla.files.raw import Raw, read_raws, write_raw
@@ -26,8 +27,7 @@ from squilla.live.pipeline import LiveSource
 from squilla.live.protocol import Picture, Spectra
 from squilla.live.record import Recorder
 from squilla.live.source import FolderFrames, MovingTwin, open_source
-from squilla.reconstruction.reconstructor import load_model
-from squilla.spectra import rgb_weights
+from squilla.reconstruction.models import load_model
 
 
 class Stack:
@@ -55,7 +55,7 @@ class Stack:
 def frames(camera, scene) -> list[Raw]:
     rate = camera.rate(scene)
     generator = torch.Generator().manual_seed(1)
-    exposure = camera.sensor.exposure_for(camera._fields(rate), 30.0)
+    exposure = camera.sensor.exposure_for(camera.fields(rate), 30.0)
     return [camera.expose(rate * (1 + 0.1 * n), exposure, generator) for n in range(3)]
 
 

@@ -58,7 +58,7 @@ def test_monte_carlo_agrees(noise):
 def test_noise_drawn_for_each_spectrum_as_in_training(snr):
     """The thesis' noise, relative to each spectrum's own measurement, leaves the same error."""
     generator = torch.Generator().manual_seed(2)
-    from squilla.spectra import natural_spectra
+    from squilla.priors import natural_spectra
 
     spectra = natural_spectra(20_000, BAND, generator=generator).double()
     prior = Prior.of(spectra, BAND)
@@ -74,7 +74,7 @@ def test_noise_drawn_for_each_spectrum_as_in_training(snr):
 def test_photons_that_are_counted():
     """Poisson photons and Gaussian read noise, drawn one by one, leave the error foretold."""
     generator = torch.Generator().manual_seed(3)
-    from squilla.spectra import natural_spectra
+    from squilla.priors import natural_spectra
 
     spectra = natural_spectra(20_000, BAND, generator=generator).double()
     prior, sensitivity, noise = Prior.of(spectra, BAND), response(2), PhotonNoise(80.0, 2.0)

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from random_camera import smooth_camera
+from squilla.reconstruction.models import MODELS, model_class
 from squilla.reconstruction.networks import CNN, MLP, ResCNN, ReSpecNN, UNet
-from squilla.reconstruction.reconstructor import MODELS, model_class
 
 # Thesis, tables 5.1 and 5.2 with the layers worked out; BEST camera paper.
 WEIGHTS = {CNN: 1030466, ResCNN: 3566387, UNet: 18504264, ReSpecNN: 4066562, MLP: 1146251}

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from browser import MISSING, Browser, find
+from squilla.colour import rgb
 from squilla.errors import InputError
 from squilla.files.cube import labelled
-from squilla.spectra import rgb
 
 WAVELENGTH = np.linspace(500, 750, 251)
 

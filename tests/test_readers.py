@@ -18,7 +18,7 @@ from targets import CORPUS, TARGETS, prepare, run, small_calibration
 
 from squilla.calibration.store import load_calibration
 from squilla.errors import InputError
-from squilla.reconstruction.reconstructor import load_model, model_class
+from squilla.reconstruction.models import load_model, model_class
 
 FEW = settings(
     max_examples=15,

@@ -11,16 +11,11 @@ from random_camera import smooth_camera
 from squilla import InputError
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
+from squilla.priors import broad_spectra
 from squilla.reconstruction.linear import Ridge
-from squilla.reconstruction.reconstructor import (
-    MODELS,
-    consistent_scale,
-    fingerprint,
-    load_model,
-    model_class,
-    models,
-)
-from squilla.spectra import broad_spectra
+from squilla.reconstruction.models import MODELS, load_model, model_class, models
+from squilla.reconstruction.reconstructor import consistent_scale
+from squilla.reconstruction.weights import fingerprint
 
 CAMERA = smooth_camera(0, filters=12, bands=48, angles=3)
 NETWORKS = [name for name in MODELS if model_class(name).trained]

@@ -17,7 +17,8 @@ from squilla.calibration.sensitivity import (
 from squilla.errors import InputError
 from squilla.optics.angle import pupil_cone
 from squilla.optics.filters import StencilRecipe
-from squilla.spectra import gaussian_mixtures, grid, lights, reflectances
+from squilla.priors import gaussian_mixtures
+from squilla.spectra import grid, lights, reflectances
 
 GRID = grid(500, 750, 2.5)
 CORNER = 0.163

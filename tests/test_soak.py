@@ -23,7 +23,7 @@ from squilla.files.raw import Raw
 from squilla.live.pipeline import LiveSource
 from squilla.live.record import Recorder
 from squilla.live.source import MovingTwin
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 MINUTES = float(os.environ.get("SQUILLA_SOAK_MINUTES", "10"))
 GONE = (OSError, TimeoutError, websockets.WebSocketException)

@@ -10,6 +10,7 @@ from sklearn.linear_model import Lasso
 
 from random_camera import smooth_camera
 from squilla.calibration.calibration import Calibration
+from squilla.priors import broad_spectra
 from squilla.reconstruction.active_set import nonnegative_lasso
 from squilla.reconstruction.sparse import (
     NonNegative,
@@ -17,7 +18,6 @@ from squilla.reconstruction.sparse import (
     gaussian_lines,
     two_step,
 )
-from squilla.spectra import broad_spectra
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 import squilla
 from random_camera import smooth_camera
 from squilla import CameraDesign, InputError
+from squilla.priors import broad_spectra, gaussian_mixtures
 from squilla.reconstruction.linear import Ridge
-from squilla.reconstruction.reconstructor import load_model
-from squilla.spectra import broad_spectra, gaussian_mixtures
+from squilla.reconstruction.models import load_model
 from squilla.training.data import Samples
 from squilla.training.fit import train
 from squilla.training.noise import SensorNoise, add_gain_errors, add_noise, drop_channels

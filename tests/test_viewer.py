@@ -16,6 +16,7 @@ from websockets.frames import Frame, Opcode
 
 from serving import Line, running
 from squilla.cli.app import app
+from squilla.colour import linear_rgb
 from squilla.errors import InputError
 from squilla.evaluation.metrics import sam
 from squilla.files.cube import labelled, save
@@ -23,7 +24,7 @@ from squilla.live import protocol, server
 from squilla.live.protocol import Picture, Spectra
 from squilla.live.reference import parse_references, read_references
 from squilla.live.stored import StoredCube
-from squilla.spectra import grid, linear_rgb
+from squilla.spectra import grid
 
 
 @pytest.fixture(scope="module")

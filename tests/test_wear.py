@@ -22,7 +22,7 @@ from squilla.camera.wear import Dust, Wear, WornCamera, drop_rows
 from squilla.cli.app import app
 from squilla.errors import InputError
 from squilla.files.raw import write_raw
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 
 def capture(camera, source="corn-kernel", snr=30.0, seed=1):
@@ -32,7 +32,7 @@ def capture(camera, source="corn-kernel", snr=30.0, seed=1):
     if source == "doll":
         picture, depth = solid_scene(wavelength, size)
     rate = camera.rate(picture, depth=depth)
-    exposure = camera.sensor.exposure_for(camera._fields(rate), snr)
+    exposure = camera.sensor.exposure_for(camera.fields(rate), snr)
     raw = camera.expose(rate, exposure, torch.Generator().manual_seed(seed))
     return raw, camera.truth(picture, depth=depth).cube.values
 

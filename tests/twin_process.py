@@ -1,6 +1,7 @@
 """A twin camera in a process of its own, quick to start and fit to be killed."""
 
 import multiprocessing
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -33,13 +34,19 @@ def serve(ready, rate: float) -> None:
         ready.recv()
 
 
-def start(rate: float = 20.0):
-    """Return a process that is a camera and answers already, and the pipe that it lives by."""
+@contextmanager
+def started(rate: float = 20.0):
+    """Run a process that is a camera and answers already; at the end it is killed."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["squilla.live.twin_camera", "numba"])
     ours, theirs = context.Pipe()
     process = context.Process(target=serve, args=(theirs, rate), daemon=True)
     process.start()
-    assert ours.poll(60)
-    assert ours.recv()
-    return process, ours
+    try:
+        assert ours.poll(60)
+        assert ours.recv()
+        yield process
+    finally:
+        process.kill()
+        process.join()
+        ours.close()

@@ -27,7 +27,7 @@ _HOME = {
     "measure": "calibration.alignment",
     "align_stack": "calibration.stack",
     "Reconstructor": "reconstruction.reconstructor",
-    "load_model": "reconstruction.reconstructor",
+    "load_model": "reconstruction.models",
     "train": "training.fit",
     "evaluate": "evaluation.metrics",
     "show": "evaluation.plots",
@@ -50,7 +50,8 @@ if TYPE_CHECKING:
     from squilla.files.cube import labelled, load_cube, read_scene, save
     from squilla.files.raw import Raw, read_raw
     from squilla.optics.filters import StencilRecipe
-    from squilla.reconstruction.reconstructor import Reconstructor, load_model
+    from squilla.reconstruction.models import load_model
+    from squilla.reconstruction.reconstructor import Reconstructor
     from squilla.training.fit import train
 
 

@@ -30,9 +30,9 @@ from squilla.camera.twin import Camera, Truth
 from squilla.errors import InputError
 from squilla.evaluation.report import Trial, results_section, scene_section, write_report
 from squilla.files.cube import save
-from squilla.files.disk import replacing
+from squilla.files.disk import make_folder, replacing
 from squilla.files.raw import Raw, read_raw, write_raw
-from squilla.reconstruction.reconstructor import load_model, model_class
+from squilla.reconstruction.models import load_model, model_class
 from squilla.spectra import lights
 
 MODELS = ("ridge", "sparse", "compound")
@@ -99,10 +99,7 @@ def demo(
     for name in models:
         model_class(name)
     twin = Camera(camera)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"The folder {folder} cannot be made: {error.strerror}.") from error
+    make_folder(folder)
     with _progress() as progress, ThreadPoolExecutor(1) as pool:
         warm = pool.submit(_warm_up, models)
         learnt = _calibrate(twin, seed, progress)

@@ -13,16 +13,17 @@ import numpy as np
 import tifffile
 
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
+from squilla.calibration.lessons import read_sweep
 from squilla.calibration.store import load_calibration
 from squilla.camera.design import CameraDesign
-from squilla.cli.steps import read_depth, read_sweep
 from squilla.errors import InputError
 from squilla.files.cube import labelled, load_cube, read_scene, save
+from squilla.files.depth import read_depth
 from squilla.files.journal import Journal
 from squilla.files.raw import Raw, list_frames, read_raw, write_raw
 from squilla.optics.filters import StencilRecipe, read_filters
 from squilla.optics.materials import refractive_index
-from squilla.reconstruction.reconstructor import load_model, model_class
+from squilla.reconstruction.models import load_model, model_class
 
 CORPUS = Path(__file__).parent / "corpus"
 WAVELENGTH = np.array([500.0, 550.0, 600.0, 650.0, 750.0])

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from squilla.calibration.calibration import Calibration, Pixels
-from squilla.spectra import second_moment
+from squilla.priors import second_moment
 
 _MODEL = 0.01
 """What the model R may be wrong by in each channel, against the signal, beside its known errors."""

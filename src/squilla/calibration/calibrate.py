@@ -101,6 +101,11 @@ def calibrate(
     if target is not None and (target_distance is None or not target_distance > 0):
         raise InputError("Give the distance of the target in mm.")
     seen = [_evenly_lit(raw, light, darks) for raw in ([target] if target else []) + list(shots)]
+    if len(seen) == 1 and target is None and target_distance is None:
+        raise InputError(
+            "One hand-held shot tells nothing of its distance; give several, or a target whose "
+            "distance was measured."
+        )
     aligned = {}
     if len(seen) > 1:
         distances = {0: target_distance} if target_distance else {}

@@ -16,7 +16,7 @@ from squilla.calibration.pixels import Darks, Stack
 from squilla.calibration.views import windows
 from squilla.errors import InputError
 from squilla.files.raw import Raw
-from squilla.spectra import second_moment
+from squilla.priors import second_moment
 
 _DRIFT = 0.3
 """Drift of the filters that is told, nm."""
@@ -158,13 +158,8 @@ def _drift(calibration: Calibration, ratio: np.ndarray) -> tuple[float, float, f
     -----
     ratio = lamp (1 + colour) (1 + drift slope) response, solved for few units that do not follow.
     """
-    white = calibration.white
-    assert white is not None
     response = calibration.mean_sensitivity.double().numpy()
-    moment = second_moment(calibration.wavelength).numpy()
-    seen = response @ moment @ response.T
-    seen += 1e-4 * np.trace(seen) / len(seen) * np.eye(len(seen))
-    lamp = moment @ response.T @ np.linalg.solve(seen, white)
+    lamp = _lamp(calibration)
     level = response @ lamp
     wavelength = calibration.wavelength
     place = 2 * (wavelength - wavelength[0]) / np.ptp(wavelength) - 1
@@ -187,19 +182,25 @@ def _drift(calibration: Calibration, ratio: np.ndarray) -> tuple[float, float, f
     return float(fit[-1] / brightness), float(error / brightness), brightness, own
 
 
+def _lamp(calibration: Calibration) -> np.ndarray:
+    """Return the spectrum of the flats' lamp as their levels and the prior tell it, (K,)."""
+    white = calibration.white
+    assert white is not None
+    response = calibration.mean_sensitivity.double().numpy()
+    moment = second_moment(calibration.wavelength).numpy()
+    seen = response @ moment @ response.T
+    seen += 1e-4 * np.trace(seen) / len(seen) * np.eye(len(seen))
+    return moment @ response.T @ np.linalg.solve(seen, white)
+
+
 def _local(relative: np.ndarray, good: np.ndarray, calibration: Calibration) -> np.ndarray:
     """Return the change of each pixel against the median of its sub-image, (rows, columns).
 
     relative : (rows, columns) light over the calibrated flat.
     """
-    lattice, white = calibration.lattice, calibration.white
+    lattice = calibration.lattice
     assert lattice is not None
-    assert white is not None
-    response = calibration.sensitivity
-    gram = response.mean(0) @ response.mean(0).T
-    gram += 1e-4 * np.trace(gram) / len(gram) * np.eye(len(gram))
-    lamp = response.mean(0).T @ np.linalg.solve(gram, white)
-    fall = response @ lamp  # (A, M)
+    fall = calibration.sensitivity @ _lamp(calibration)  # (A, M)
     change = np.ones(relative.shape, np.float32)
     weight = uniform_filter(good.astype(np.float32), 5)
     smooth = uniform_filter(np.where(good, relative, 0).astype(np.float32), 5)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Generator
 from xarray import DataArray
 
+from squilla.calibration.calibrate import calibrate
 from squilla.calibration.calibration import Calibration, Pixels
 from squilla.calibration.geometry import lattice_at
 from squilla.calibration.known import KnownScene
@@ -138,6 +140,24 @@ class Rehearsal:
         scene = poster(self.camera.design.field.size + 100, self.camera.design.wavelength)
         rate = self.camera.rate(scene, distance=self.distance)
         return self.camera.expose(rate, self._exposure(rate), self._generator(4, 0))
+
+    def calibrate(self, **lessons: Any) -> Calibration:
+        """Take the frames and learn the camera from them.
+
+        Parameters
+        ----------
+        lessons
+            Arguments of `squilla.calibrate` in place of the rehearsal's own darks, flats, sweep,
+            target and its distance; None where there shall be none.
+
+        Returns
+        -------
+        Calibration
+        """
+        own = {"dark": self.dark, "flat": self.flat, "sweep": self.sweep, "target": self.target}
+        frames = {name: take() for name, take in own.items() if name not in lessons}
+        given: dict[str, Any] = {"target_distance": self.distance, **frames, **lessons}
+        return calibrate(self.camera.design, **given)
 
     def _band(self, wavelength: float) -> np.ndarray:
         """Return the light of one step, (K,); all of it together, also beyond the band, is 1."""

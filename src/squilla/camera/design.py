@@ -357,5 +357,6 @@ def design_path(source: str | Path) -> Path:
         if path.is_file():
             return path
     raise InputError(
-        f"There is no camera design {str(source)!r}: give one of {designs()} or a TOML file."
+        f"There is no camera design {str(source)!r}; there are {', '.join(designs())}, or give a "
+        "TOML file of your own."
     )

@@ -120,7 +120,7 @@ def load_scene(
         return fitted(scene, wavelength, size)
     folder = Path(str(package_files("squilla"))) / "data" / "scenes"
     picture = fitted(read_scene(folder / shipped), wavelength, size)
-    lamp = lights().on(wavelength)[lights().name.index(light)]
+    lamp = lights().one(light, wavelength)
     own = np.percentile(picture.values, 99, axis=(0, 1))
     values = np.clip(picture.values / own, 0, 1.2) * lamp
     return labelled(

@@ -121,16 +121,13 @@ def solid_scene(
         height, shade = np.where(front, (own, 0.8 - 0.18 * lean), (height, shade))
         surface[front] = _mixed(part.materials, mix[front], wavelength)
     depth = distance + relief * (0.5 - np.clip(height, 0, 1))
-    lamp = lights().on(wavelength)[lights().name.index(light)].astype(np.float32)
+    lamp = lights().one(light, wavelength).astype(np.float32)
     scene = surface * lamp * shade[..., None].astype(np.float32)
     return labelled(scene, wavelength, attributes={"name": "doll", "light": light}), depth
 
 
 def _mixed(materials: tuple[str, str], mix: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
-    table = reflectances()
-    one, other = (
-        table.on(wavelength)[table.name.index(name)].astype(np.float32) for name in materials
-    )
+    one, other = (reflectances().one(name, wavelength).astype(np.float32) for name in materials)
     return one + mix[..., None].astype(np.float32) * (other - one)
 
 

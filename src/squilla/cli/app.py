@@ -5,9 +5,13 @@ from typing import Annotated
 import typer
 
 from squilla import __version__
-from squilla.cli import camera, cameras, filters, steps
+from squilla.cli import camera, cameras, filters, twin
 from squilla.cli.align import align
+from squilla.cli.calibrate import calibrate, check
+from squilla.cli.demo import demo
+from squilla.cli.evaluate import evaluate
 from squilla.cli.export import export_model
+from squilla.cli.reconstruct import reconstruct
 from squilla.cli.train import train
 from squilla.cli.view import live, view
 
@@ -18,17 +22,17 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-app.command()(steps.demo)
+app.command()(demo)
 app.command()(camera.camera)
 app.add_typer(filters.app, name="filters")
-app.command()(steps.simulate)
-app.command()(camera.rehearse)
-app.command()(steps.calibrate)
+app.command()(twin.simulate)
+app.command()(twin.rehearse)
+app.command()(calibrate)
 app.command()(train)
 app.command()(align)
-app.command()(steps.check)
-app.command()(steps.reconstruct)
-app.command()(steps.evaluate)
+app.command()(check)
+app.command()(reconstruct)
+app.command()(evaluate)
 app.command()(view)
 app.command()(live)
 app.command()(cameras.cameras)

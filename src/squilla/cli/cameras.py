@@ -88,7 +88,7 @@ def grab(
 
     from rich.progress import track
 
-    from squilla.cli.checks import make_folder
+    from squilla.files.disk import make_folder
     from squilla.files.raw import write_raw
     from squilla.live.genicam import open_camera
 

@@ -31,11 +31,3 @@ def check_distance(distance: float | None) -> None:
     """Refuse a distance that is no positive number of mm; None is one to be found."""
     if distance is not None and not 0 < distance < math.inf:
         raise InputError(f"The distance must be a positive number of mm, not {distance:g}.")
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder, and those above it, where there is none."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"The folder {path} cannot be made: {error.strerror}.") from error

@@ -21,7 +21,7 @@ def export_model(
     Example: squilla export-model --calibration camera.nc --model respecnn.safetensors -o net.onnx
     """
     from squilla.calibration.store import load_calibration
-    from squilla.reconstruction.reconstructor import load_model
+    from squilla.reconstruction.models import load_model
 
     load_model(model, load_calibration(calibration)).export(output)
     typer.echo(f"{output}: `{model}`")

@@ -130,7 +130,7 @@ def live(
     from squilla.live.pipeline import LiveSource
     from squilla.live.record import Recorder
     from squilla.live.source import open_source
-    from squilla.reconstruction.reconstructor import load_model
+    from squilla.reconstruction.models import load_model
 
     check_distance(distance)
     # A frame is measured while another is reconstructed; threads that wait for cores waste them.

@@ -155,7 +155,7 @@ def ciede2000(
     """
     import colour
 
-    from squilla.spectra import tristimulus
+    from squilla.colour import tristimulus
 
     white = tristimulus(light, wavelength)
     lab = [

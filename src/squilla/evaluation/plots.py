@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from xarray import DataArray
 
+from squilla.colour import composite, rgb, tristimulus
 from squilla.errors import InputError
 from squilla.evaluation.metrics import DARKEST, mse
 from squilla.evaluation.style import (
@@ -25,7 +26,6 @@ from squilla.evaluation.style import (
     styled,
 )
 from squilla.files.lazy import DIMS
-from squilla.spectra import composite, rgb, tristimulus
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -77,6 +77,14 @@ def flush(path: Path) -> None:
                 os.fsync(stream.fileno())
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder, and those above it, where there is none; InputError if that is refused."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"The folder {path} cannot be made: {error.strerror}.") from error
+
+
 def existing(path: str | Path) -> Path:
     """Return `path`, or say that nothing is there."""
     path = Path(path)

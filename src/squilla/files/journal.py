@@ -61,16 +61,17 @@ class Journal:
         try:
             first, *told = [json.loads(line) for line in lines] or [None]
             for line in told:
-                name = line.pop("name")
+                name = str(line.pop("name"))
                 self.done.pop(name, None)
                 if "failed" not in line:
                     self.done[name] = line
-        except (ValueError, KeyError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"{self.path} is damaged ({error}); give another output.") from error
         if first is None:
             self._append({"recipe": self._recipe})
         elif first != {"recipe": self._recipe}:
-            begun = first.get("recipe", {}) if isinstance(first, dict) else {}
+            begun = first.get("recipe") if isinstance(first, dict) else None
+            begun = begun if isinstance(begun, dict) else {}
             changed = [key for key, value in self._recipe.items() if begun.get(key) != value]
             raise InputError(
                 f"{self.path} was begun with another {' and '.join(changed) or 'recipe'}; "

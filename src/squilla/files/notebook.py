@@ -9,8 +9,8 @@ from secrets import token_hex
 import numpy as np
 from xarray import DataArray
 
+from squilla.colour import rgb
 from squilla.errors import InputError
-from squilla.spectra import rgb
 
 _POINTS, _BANDS = 64, 84
 """Points a side and bands that a notebook keeps of a cube: about half a megabyte."""

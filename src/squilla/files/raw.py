@@ -11,7 +11,7 @@ import numpy as np
 
 from squilla.errors import InputError
 from squilla.files.disk import check_size, existing, reading, replacing
-from squilla.files.tiff import read_page
+from squilla.files.tiff import opened, read_page
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +53,7 @@ class Frame:
         """Read the frame; errors as in `read_raw`."""
         if self.page is None:
             return read_raw(self.path)
-        import tifffile
-
-        with reading(self.path, "TIFF"), tifffile.TiffFile(self.path) as tiff:
+        with opened(self.path) as tiff:
             page = tiff.pages[self.page]
             frame, facts = read_page(self.path, page), _described(getattr(page, "description", ""))
         return _raw(self.path, frame, facts)
@@ -88,9 +86,7 @@ def _files(path: Path) -> list[Path]:
 
 def _pages(path: Path) -> list[Frame]:
     if path.suffix.lower() in (".tif", ".tiff"):
-        import tifffile
-
-        with reading(path, "TIFF"), tifffile.TiffFile(path) as tiff:
+        with opened(path) as tiff:
             count = len(tiff.pages)
         if count > 1:
             return [Frame(path, page) for page in range(count)]
@@ -191,9 +187,7 @@ def write_raw(path: str | Path, raw: Raw) -> None:
 
 
 def _read_tiff(path: Path) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
-    import tifffile
-
-    with reading(path, "TIFF"), tifffile.TiffFile(path) as tiff:
+    with opened(path) as tiff:
         if not len(tiff.pages):
             raise InputError(f"{path} holds no picture; it may be cut short.")
         for page in tiff.pages:

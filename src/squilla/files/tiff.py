@@ -1,8 +1,11 @@
 """TIFF: one grey page for each band, what else is known as JSON in the description."""
 
 import json
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from xarray import DataArray
@@ -10,6 +13,9 @@ from xarray import DataArray
 from squilla.errors import InputError
 from squilla.files.disk import check_size, reading, replacing
 from squilla.files.lazy import OnDisk, lazy
+
+if TYPE_CHECKING:
+    from tifffile import TiffFile
 
 
 def write_tiff(array: DataArray, path: Path) -> None:
@@ -33,9 +39,7 @@ def write_tiff(array: DataArray, path: Path) -> None:
 
 def open_tiff(path: Path) -> DataArray:
     """Open a cube of one grey page a band, whose numbers are read when used."""
-    import tifffile
-
-    with reading(path, "TIFF"), tifffile.TiffFile(path) as tiff:
+    with opened(path) as tiff:
         first = tiff.pages.first
         check_size(path, len(tiff.pages) * first.nbytes)
         bands = _mapped(path, tiff)
@@ -55,6 +59,30 @@ def open_tiff(path: Path) -> DataArray:
         return lazy(OnDisk(bands, (1, 2, 0)), coords, told["name"], told["attributes"])
 
 
+@contextmanager
+def opened(path: Path) -> "Iterator[TiffFile]":
+    """Open a TIFF whose chain of pages comes to an end; damaged ones go round in a circle."""
+    import tifffile
+
+    with reading(path, "TIFF"), tifffile.TiffFile(path) as tiff:
+        layout, handle = tiff.tiff, tiff.filehandle
+        link, seen = layout.offsetsize, set()  # where the place of the first page stands
+        while True:
+            handle.seek(link)
+            (page,) = struct.unpack(layout.offsetformat, handle.read(layout.offsetsize))
+            if page in seen:
+                raise InputError(f"{path} is damaged: its pages go round in a circle.")
+            if not 0 < page < handle.size - layout.tagnosize:
+                break
+            seen.add(page)
+            handle.seek(page)
+            (tags,) = struct.unpack(layout.tagnoformat, handle.read(layout.tagnosize))
+            link = page + layout.tagnosize + tags * layout.tagsize
+            if link > handle.size - layout.offsetsize:
+                break
+        yield tiff
+
+
 def _mapped(path: Path, tiff: Any) -> np.ndarray:
     """Return the pages of a TIFF as one array, mapped from the disk where they lie plain on it."""
     first, starts = tiff.pages.first, [page.dataoffsets for page in tiff.pages]
@@ -68,9 +96,7 @@ def _mapped(path: Path, tiff: Any) -> np.ndarray:
 
 def read_pages(path: Path) -> np.ndarray:
     """Read a TIFF of grey pages of one size, (pages, rows, columns)."""
-    import tifffile
-
-    with reading(path, "TIFF"), tifffile.TiffFile(path) as tiff:
+    with opened(path) as tiff:
         return _stacked(path, tiff)
 
 

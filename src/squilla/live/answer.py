@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from xarray import DataArray
 
+from squilla.colour import rgb_weights
 from squilla.errors import InputError
 from squilla.evaluation.metrics import sam
 from squilla.live.protocol import Picture, Region, Spectra
-from squilla.spectra import rgb_weights
 
 LARGEST_SIDE = 1024
 """Longest side of a picture that is sent, px; of a longer one every n-th pixel is taken."""

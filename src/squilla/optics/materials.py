@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from squilla.errors import InputError
+from squilla.files.tables import read_columns
 
 
 def refractive_index(material: str | Path, wavelength: np.ndarray | float) -> np.ndarray:
@@ -70,44 +71,6 @@ def materials() -> tuple[str, ...]:
     )
 
 
-def read_columns(path: Path) -> np.ndarray:
-    """Read a text table of numbers in columns, after any number of lines of heading.
-
-    Parameters
-    ----------
-    path : Path
-        Columns parted by commas, semicolons, tabs or blanks; lines that begin with # are skipped.
-
-    Returns
-    -------
-    array, (rows, columns)
-
-    Raises
-    ------
-    InputError
-        If a line after the first row of numbers is not a row of as many numbers.
-    """
-    rows: list[list[float]] = []
-    for number, line in enumerate(_text(path).splitlines(), 1):
-        cells = line.split("#")[0].replace(",", " ").replace(";", " ").split()
-        if not cells:
-            continue
-        try:
-            row = [float(cell) for cell in cells]
-        except ValueError:
-            if not rows:
-                continue  # still the heading
-            raise InputError(f"{path}, line {number}: {line.strip()!r} is not numbers.") from None
-        if rows and len(row) != len(rows[0]):
-            raise InputError(
-                f"{path}, line {number}: {len(row)} columns, but {len(rows[0])} in the rows before."
-            )
-        rows.append(row)
-    if not rows:
-        raise InputError(f"{path} holds no row of numbers; expected columns, wavelength first.")
-    return np.array(rows)
-
-
 class _Part(NamedTuple):
     """One quantity of a material, n or k, over a range of wavelengths in nm."""
 
@@ -150,7 +113,7 @@ def _text(path: Path) -> str:
 
 
 def _read_csv(path: Path) -> list[_Part]:
-    columns = read_columns(path).T
+    columns = read_columns(path)[0].T
     if not 2 <= len(columns) <= 3:
         raise InputError(f"{path} has {len(columns)} columns; expected wavelength, n and maybe k.")
     if columns[0].max() < 100:

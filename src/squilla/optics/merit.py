@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from squilla.errors import InputError
-from squilla.spectra import PRIORS, grid
+from squilla.priors import PRIORS
+from squilla.spectra import grid
 
 # --- what is known before anything is measured --------------------------------------------------
 
@@ -55,7 +56,7 @@ class Prior:
         count: int = 20_000,
         seed: int = 0,
     ) -> "Prior":
-        """Return the prior of random spectra of a kind, one of ``squilla.spectra.PRIORS``.
+        """Return the prior of random spectra of a kind, one of ``squilla.priors.PRIORS``.
 
         The default wavelengths are those of `grid`, nm; their number changes the error little,
         which is a mean over bands.

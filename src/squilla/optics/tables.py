@@ -11,8 +11,8 @@ from torch import Tensor
 
 from squilla.errors import InputError
 from squilla.files.disk import check_size, reading
+from squilla.files.tables import read_columns
 from squilla.optics.angle import blue_shift
-from squilla.optics.materials import read_columns
 from squilla.spectra import grid
 
 
@@ -183,7 +183,7 @@ def _read_npy(path: Path) -> tuple[np.ndarray, None]:
 
 
 def _read_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    columns = read_columns(path).T
+    columns = read_columns(path)[0].T
     return columns[1:], columns[0]
 
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from squilla.calibration.agreement import model_error
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
+from squilla.priors import second_moment
 from squilla.reconstruction.reconstructor import Reconstructor
-from squilla.spectra import second_moment
 
 SNR = 20.0
 """Signal-to-noise ratio assumed where none is known, dB: what the thesis found for its camera."""
@@ -28,7 +28,7 @@ class Ridge(Reconstructor):
     values of the estimate are clipped to zero, which moves every spectrum nearer to the truth or
     leaves it.
 
-    Source: N. Wiener; here with the prior of spectra.broad_spectra.
+    Source: N. Wiener; here with the prior of priors.broad_spectra.
 
     Parameters
     ----------

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from squilla.spectra import resample, within_tables
+from squilla.priors import within_tables
+from squilla.spectra import resample
 
 STORED = "weights.prior_"
 """How the prior's tensors are named in a model file."""

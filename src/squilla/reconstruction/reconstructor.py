@@ -1,11 +1,8 @@
-"""What every reconstructor is: a torch module from measurements to spectra, made by name."""
+"""What every reconstructor is: a torch module from measurements to spectra."""
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from importlib import import_module
-from importlib.resources import files as package_files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -17,7 +14,7 @@ from squilla import __version__
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
-from squilla.files.disk import replacing
+from squilla.priors import broad_spectra
 from squilla.reconstruction.engine import (
     Network,
     check_engine,
@@ -26,29 +23,12 @@ from squilla.reconstruction.engine import (
     write_onnx,
 )
 from squilla.reconstruction.partial import PointwiseReconstruction, Reconstruction
-from squilla.spectra import broad_spectra
+from squilla.reconstruction.weights import digest, fingerprint, write_weights
 
 if TYPE_CHECKING:
     from xarray import DataArray
 
 Scale = Literal["consistent", "maximum"]
-
-MODELS: Mapping[str, tuple[str, str, str]] = {
-    "ridge": ("linear", "Ridge", "linear Wiener estimator, one matrix per field angle; at once"),
-    "nnls": ("sparse", "NonNegative", "non-negative least squares over Gaussian line shapes"),
-    "sparse": ("sparse", "Sparse", "non-negative l1 over Gaussian line shapes; best for lines"),
-    "twist": ("sparse", "Twist", "the problem of `sparse` solved by monotone TwIST; slow"),
-    "mlp": ("networks", "MLP", "fully connected network of the BEST camera; 1.1 M weights"),
-    "cnn": ("networks", "CNN", "the thesis' convolutional network; 1.0 M weights"),
-    "rescnn": ("networks", "ResCNN", "convolutional correction of a linear estimate; 3.6 M"),
-    "unet": ("networks", "UNet", "residual U-Net along the wavelengths; 18.5 M weights"),
-    "respecnn": ("networks", "ReSpecNN", "the thesis' proposal; 4.1 M weights"),
-    "compound": ("compound", "Compound", "spatial and spectral, for every camera; with intervals"),
-}
-"""Every reconstructor by name: its file in this room, its class, and one line about it."""
-
-TOLERANCE = 0.05
-"""Largest relative RMS change of the sensitivity at which trained weights still hold."""
 
 
 class Reconstructor(nn.Module):
@@ -280,6 +260,16 @@ class Reconstructor(nn.Module):
             cube = self(y.to(device), angle, snr, scale)
         return self.labelled(cube.cpu().numpy(), measurement, scale)
 
+    def reconstruct_interval(self, measurement: Measurement) -> "tuple[DataArray, DataArray]":
+        """Return the cube, and half the width of the interval that holds nine in ten of its values.
+
+        Raises
+        ------
+        InputError
+            If this model does not know how far it is off.
+        """
+        raise InputError(f"`{self.name}` does not tell how far it may be off; `compound` does.")
+
     def look(self, measurement: Measurement) -> Reconstruction:
         """Return a reconstruction that works out only what is asked: bands, spectra, colours."""
         return PointwiseReconstruction(self, measurement)
@@ -295,7 +285,7 @@ class Reconstructor(nn.Module):
             "model": self.name,
             "software": f"squilla {__version__}",
             "calibration": fingerprint(self.calibration),
-            "weights": _digest(self.state_dict(), {})[:12] if self.trained else None,
+            "weights": digest(self.state_dict(), {})[:12] if self.trained else None,
             "scale": scale if self.trained else "solved",
         }
         origin |= {f"model_{key}": value for key, value in self.provenance.items()}
@@ -326,8 +316,6 @@ class Reconstructor(nn.Module):
         half : bool
             Store 16-bit weights: half the size, 0.1 % rounding.
         """
-        from safetensors.torch import save
-
         if not self.trained:
             raise InputError(
                 f"`{self.name}` is computed from the calibration; it has no weights to save."
@@ -341,17 +329,11 @@ class Reconstructor(nn.Module):
         tensors["sensitivity"] = self.calibration.mean_sensitivity
         tensors["wavelength"] = torch.from_numpy(np.asarray(self.wavelength, np.float64))
         metadata = {
-            "format": "squilla model 1",
             "name": self.name,
-            "software": f"squilla {__version__}",
             "calibration": fingerprint(self.calibration),
             "provenance": json.dumps(self.provenance),
         }
-        tensors = {key: value.contiguous() for key, value in tensors.items()}
-        metadata["checksum"] = _digest(tensors, metadata)
-        content = save(tensors, metadata)
-        with replacing(path) as temporary:
-            temporary.write_bytes(content)
+        write_weights(path, tensors, metadata)
 
 
 class Estimate(nn.Module):
@@ -429,144 +411,3 @@ def consistent_scale(
     power = expected.square().sum(-1, keepdim=True)
     overlap = (y * expected).sum(-1, keepdim=True).clamp_min(0)
     return overlap / torch.where(power > 0, power, 1)
-
-
-def fingerprint(calibration: Calibration) -> str:
-    """Return twelve hexadecimal digits that tell this sensitivity from every other."""
-    digest = hashlib.sha256()
-    for part in (calibration.wavelength, calibration.angle, calibration.sensitivity):
-        digest.update(np.ascontiguousarray(part, np.float32).tobytes())
-    return digest.hexdigest()[:12]
-
-
-def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
-    """Return a checksum of named tensors and text."""
-    digest = hashlib.sha256(json.dumps(dict(metadata), sort_keys=True).encode())
-    for name in sorted(tensors):
-        value = tensors[name].detach().cpu().contiguous()
-        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
-
-
-def models() -> dict[str, str]:
-    """Return the names of all reconstructors, each with one line about it."""
-    return {name: description for name, (_, _, description) in MODELS.items()}
-
-
-def model_class(name: str) -> type[Reconstructor]:
-    """Return the class of a reconstructor; each is made as ``model_class(name)(calibration)``."""
-    if name not in MODELS:
-        raise InputError(f"There is no model named {name!r}; there are {', '.join(MODELS)}.")
-    module, attribute, _ = MODELS[name]
-    return getattr(import_module(f"squilla.reconstruction.{module}"), attribute)
-
-
-def load_model(
-    name: str | Path, calibration: Calibration, engine: str | None = None
-) -> Reconstructor:
-    """Return a reconstructor, ready for this camera.
-
-    Parameters
-    ----------
-    name : str or path
-        A name of `models`, or a file written by `Reconstructor.save`.
-    calibration : Calibration
-        The camera. Weights are accepted when the sensitivity that they were trained for differs
-        from this one, after a common factor, by at most 5 % (relative RMS): a re-measured
-        calibration of the same camera.
-    engine : str, optional
-        What runs the networks; see `Reconstructor.with_engine`. Default: PyTorch.
-
-    Raises
-    ------
-    InputError
-        If the name is unknown, the file is damaged or foreign, or made for another camera; if the
-        engine is unknown or its packages are missing.
-    """
-    model = _loaded(name, calibration)
-    return model if engine is None else model.with_engine(engine)
-
-
-def _loaded(name: str | Path, calibration: Calibration) -> Reconstructor:
-    if not isinstance(calibration, Calibration):
-        raise InputError(
-            "A model is loaded for a Calibration: read one with load_calibration, or make one "
-            "with Calibration.from_sensitivity."
-        )
-    if isinstance(name, str) and name in MODELS:
-        kind = model_class(name)
-        if not kind.trained:
-            return kind(calibration)
-        path = Path(str(package_files("squilla"))) / "data" / "weights" / f"{name}.safetensors"
-        if not path.is_file():
-            raise InputError(f"No weights ship for `{name}`; train it for your camera first.")
-    else:
-        path = Path(name)
-        if not path.is_file():
-            raise InputError(
-                f"{str(name)!r} is neither a model file nor the name of a model; the names are "
-                f"{', '.join(MODELS)}."
-            )
-    return _read(path, calibration)
-
-
-def _read(path: Path, calibration: Calibration) -> Reconstructor:
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} is not a whole model file ({error}).") from error
-    stated = metadata.pop("checksum", None)
-    if stated is not None and stated != _digest(tensors, metadata):
-        raise InputError(f"{path} is damaged: it is not what its checksum says; copy it again.")
-    foreign = InputError(f"{path} is not a model of squilla; make one with train.")
-    name = metadata.get("name", "")
-    if metadata.get("format") != "squilla model 1" or name not in MODELS:
-        raise foreign
-    try:
-        provenance = json.loads(metadata["provenance"])
-        sensitivity, wavelength = tensors.pop("sensitivity"), tensors.pop("wavelength")
-    except (KeyError, ValueError) as error:
-        raise foreign from error
-    if not model_class(name).universal:
-        _check_camera(path, sensitivity, wavelength.numpy(), calibration)
-    weights = {key.removeprefix("weights."): value for key, value in tensors.items()}
-    model = model_class(name).for_weights(calibration, weights)
-    expected = model.state_dict()
-    if not model.trained or {k: v.shape for k, v in weights.items()} != {
-        k: v.shape for k, v in expected.items()
-    }:
-        raise InputError(f"{path} holds other weights than `{name}` has; train it again.")
-    if not all(value.isfinite().all() for value in weights.values()):
-        raise InputError(f"{path} holds weights that are not finite; train it again.")
-    model.load_state_dict(weights)
-    model.provenance = provenance
-    return model.eval()
-
-
-def _check_camera(
-    path: Path, sensitivity: Tensor, wavelength: np.ndarray, calibration: Calibration
-) -> None:
-    """Refuse weights that were trained for another camera than `calibration`."""
-    own = calibration.mean_sensitivity.double()
-    if sensitivity.shape != own.shape or not np.allclose(
-        wavelength, calibration.wavelength, rtol=0, atol=1e-3
-    ):
-        raise InputError(
-            f"{path} was trained for {' channels and '.join(map(str, sensitivity.shape))} bands, "
-            f"{wavelength[0]:g}-{wavelength[-1]:g} nm; the calibration has {own.shape[0]} channels "
-            f"and {own.shape[1]} bands, {calibration.wavelength[0]:g}-"
-            f"{calibration.wavelength[-1]:g} nm. Train a model for this camera."
-        )
-    theirs = sensitivity.double()
-    factor = (own * theirs).sum() / theirs.square().sum().clamp_min(1e-300)
-    difference = float((own - factor * theirs).norm() / own.norm())
-    if not difference <= TOLERANCE:
-        raise InputError(
-            f"{path} was trained for a sensitivity that differs from the calibration's by "
-            f"{difference:.1%} (at most {TOLERANCE:.0%} is allowed). Train a model for this camera."
-        )

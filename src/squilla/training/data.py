@@ -10,8 +10,8 @@ from torch import Tensor
 
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
+from squilla.priors import PRIORS
 from squilla.reconstruction.linear import complete
-from squilla.spectra import PRIORS
 from squilla.training.noise import Noise, add_gain_errors, add_noise, drop_channels
 
 

@@ -17,11 +17,9 @@ from torch import Tensor, nn
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.files.disk import replacing
-from squilla.reconstruction.reconstructor import (
-    Reconstructor,
-    fingerprint,
-    model_class,
-)
+from squilla.reconstruction.models import model_class
+from squilla.reconstruction.reconstructor import Reconstructor
+from squilla.reconstruction.weights import fingerprint
 from squilla.training.data import Samples
 from squilla.training.noise import Noise, SensorNoise
 from squilla.training.processes import Processes, joined

@@ -14,14 +14,8 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional
 
-from squilla.spectra import (
-    CHART_LIGHT,
-    gaussian_mixtures,
-    lights,
-    line_spectra,
-    reflectances,
-    within_tables,
-)
+from squilla.priors import gaussian_mixtures, line_spectra, within_tables
+from squilla.spectra import CHART_LIGHT, lights, reflectances
 
 HELD_OUT = 8
 """Of so many reflectances and lamps one is kept for validation, never trained on."""
