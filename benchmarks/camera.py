@@ -137,7 +137,7 @@ def lossy(seconds: float = 60.0) -> dict[str, float]:
 def restarted() -> float:
     """Return the seconds from the start of a camera that was killed to its next frame."""
     with twin_process.started() as process, open_camera(HERE) as camera:
-        camera.read()
+        camera.read(timeout=30)
         process.kill()
         process.join()
         with twin_process.started():  # answers already

@@ -34,8 +34,9 @@ from squilla.calibration.rehearsal import Rehearsal
 from squilla.calibration.views import evened, sub_images
 from squilla.camera.twin import Camera
 from squilla.files.raw import Raw
+from squilla.live.connection import Statistics
 from squilla.live.pipeline import LiveSource
-from squilla.live.source import Counts, FrameSource
+from squilla.live.source import FrameSource
 from squilla.live.twin_camera import camera_within
 from squilla.live.twin_frames import TwinFrames, views
 
@@ -52,7 +53,7 @@ class Ready:
     exposures = gains = gain = None
 
     def __init__(self, raws: list[Raw]):
-        self.raws, self.statistics, self.report = raws, Counts(), print
+        self.raws, self.statistics, self.report = raws, Statistics(), print
         self.exposure = raws[0].exposure
 
     def check_size(self, shape) -> None: ...

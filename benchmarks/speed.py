@@ -118,7 +118,8 @@ def rows(options: argparse.Namespace) -> dict[str, tuple[Callable[[], object], f
     for name, function in parts.items():
         result[f"only {name}, {best}"] = function, fewer, PIXELS * 12.0
     if options.camera:
-        result |= from_raw(options.camera, best, products, whole)
+        for engine in engines[1:3] or engines:
+            result |= from_raw(options.camera, engine, products, whole)
     ridge = load_model("ridge", flat)
     result["ridge"] = lambda: ridge.reconstruct(seen), PIXELS * 36 * (36 + BANDS), whole
     if options.network:
@@ -196,10 +197,13 @@ def main() -> None:
         print(
             "| " + " | ".join([name, *(f"{1000 * row[key]:.1f}" for key in list(row)[1:])]) + " |"
         )
-    if not options.only:
-        told = {"threads": threads, "load": load, "machine": platform.machine()}
-        told |= {"multiply_adds_per_second": speed, "seconds": table}
-        RESULTS.write_text(json.dumps(told, indent=1) + "\n")
+    told = {"threads": threads, "load": load, "machine": platform.machine()}
+    told |= {"multiply_adds_per_second": speed, "seconds": table}
+    if options.only:  # takes the place of the rows of that name
+        told = json.loads(RESULTS.read_text())
+        names = {row["row"] for row in table}
+        told["seconds"] = [row for row in told["seconds"] if row["row"] not in names] + table
+    RESULTS.write_text(json.dumps(told, indent=1) + "\n")
 
 
 if __name__ == "__main__":

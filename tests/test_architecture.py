@@ -11,7 +11,7 @@ import squilla
 
 SOURCE = Path(squilla.__file__).parent
 ORDER = (
-    "errors", "spectra", "priors", "colour", "files", "optics", "camera", "calibration",
+    "errors", "threads", "spectra", "priors", "colour", "files", "optics", "camera", "calibration",
     "reconstruction", "training", "evaluation", "live", "batch", "demo", "cli",
 )  # fmt: skip
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init__.py")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from squilla.errors import InputError
-from squilla.live.connection import Arrival, CameraInfo, CameraLost, Region
-from squilla.live.genicam import LiveCamera, Statistics
+from squilla.live.connection import Arrival, CameraInfo, CameraLost, Region, Statistics
+from squilla.live.genicam import LiveCamera
 from squilla.live.pixel_format import FORMATS
 
 

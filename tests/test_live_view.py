@@ -21,11 +21,12 @@ from squilla.errors import InputError
 from squilla.evaluation.metrics import sam
 from squilla.files.raw import Raw, read_raws, write_raw
 from squilla.live.answer import colour_bands
+from squilla.live.connection import Statistics
 from squilla.live.frame import LiveFrame
 from squilla.live.pipeline import LiveSource
 from squilla.live.protocol import Picture, Spectra
 from squilla.live.record import Recorder
-from squilla.live.source import Counts, FolderFrames, MovingTwin, open_source
+from squilla.live.source import FolderFrames, MovingTwin, open_source
 from squilla.reconstruction.models import load_model
 
 
@@ -33,7 +34,7 @@ class Stack:
     """A camera that shows given frames, the last one again and again."""
 
     def __init__(self, frames: list[Raw]):
-        self.frames, self.statistics = frames, Counts()
+        self.frames, self.statistics = frames, Statistics()
         self.exposure: float | None = frames[0].exposure
         self.gain, self.exposures, self.gains = 0.0, (0.01, 1000.0), (0.0, 24.0)
 

@@ -4,6 +4,7 @@ import warnings
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -27,6 +28,7 @@ from squilla.calibration.wear import (
 )
 from squilla.errors import InputError
 from squilla.files.raw import Raw
+from squilla.threads import single_threaded_products
 
 _TAPS = SINC.shape[0]
 
@@ -90,6 +92,7 @@ class Measurement:
         return cls(torch.where(valid, y, 0), valid, place, place, ratio, {"alignment": "given"})
 
 
+@single_threaded_products()
 def measure(
     raw: Raw,
     calibration: Calibration,
@@ -151,7 +154,7 @@ def measure(
     snr = _judge(views, raw, pixels)
     views, odd = without_odd_pixels(views, pixels)
     noise = _noise_variance(views, pixels)
-    relief, seen = None, True
+    relief, seen = None, None
     if distance is not None:
         disparity = np.full(lattice.field, lattice.disparity(distance), np.float32)
         quality = {"alignment": "from the given distance", "alignment_score": 1.0}
@@ -170,10 +173,12 @@ def measure(
             score = float(relief.confident.float().mean())
             quality = {"alignment": "a distance for every point", "alignment_score": score}
     y, valid = align(views, lattice, disparity)
-    valid = valid & torch.as_tensor(seen)
+    if seen is not None:
+        valid &= torch.from_numpy(seen)
     angle = torch.from_numpy(lattice.field_angle()).float()
     agreement = compare(y, valid, angle, calibration, pixels)
-    valid[..., torch.from_numpy(agreement.worn)] = False
+    if agreement.worn.any():
+        valid[..., torch.from_numpy(agreement.worn)] = False
     snr_of_point = pointwise_snr(y, pixels)
     signal = float(y.mean())
     if "misalignment" in quality:
@@ -209,16 +214,30 @@ def measure(
 
 def _noise_variance(views: SubImages, pixels: Pixels) -> np.ndarray:
     """Return the mean noise variance of each sub-image by the calibrated sensor, (M,) DN^2."""
-    signal = inner(views.image, views.margin).mean((1, 2)).clamp_min(0).numpy()
+    signal = np.maximum(views.level, 0)
     return signal / pixels.gain + (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
 
 
 def pointwise_snr(y: Tensor, pixels: Pixels) -> Tensor:
     """Return the signal-to-noise ratio of aligned points, (H, W, M) DN -> (H, W) dB."""
-    noise = y.mean(-1).clamp_min(0) / pixels.gain + (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
-    whole = torch.linalg.vector_norm(y, dim=-1).square() / y.shape[-1]
-    power = (whole - noise).clamp_min(0.1 * noise)
-    return 10 * torch.log10(power / noise)
+    fixed = (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
+    snr = torch.empty(y.shape[:2])
+    _pointwise_snr(y.numpy(), np.float32(1 / pixels.gain), np.float32(fixed), snr.numpy())
+    return snr
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
+def _pointwise_snr(y, shot, fixed, snr):
+    height, width, units = y.shape
+    for row in numba.prange(height):
+        for column in range(width):
+            total, square = np.float32(0), np.float32(0)
+            for unit in range(units):
+                total += y[row, column, unit]
+                square += y[row, column, unit] * y[row, column, unit]
+            noise = shot * max(total / units, np.float32(0)) + fixed
+            power = max(square / units - noise, np.float32(0.1) * noise)
+            snr[row, column] = np.float32(10) * np.log10(power / noise)
 
 
 def _judge(views: SubImages, raw: Raw, pixels: Pixels) -> float:
@@ -229,14 +248,15 @@ def _judge(views: SubImages, raw: Raw, pixels: Pixels) -> float:
             "light."
         )
     few = (slice(None), slice(None, None, 4), slice(None, None, 4))  # of two million, enough
-    good = inner(views.image, views.margin)[few][~inner(views.bad, views.margin)[few]]
+    image, bad = (each.numpy() for each in (views.image, views.bad))
+    good = inner(image, views.margin)[few][~inner(bad, views.margin)[few]]
     noise = float(_noise_variance(views, pixels).mean())
     if len(good) and float(good.mean()) < -max(2.0, np.sqrt(noise)):
         raise InputError(
             f"The frame lies {-float(good.mean()):.0f} DN below the calibrated dark level: it has "
             "another bit depth or black level than the calibration's frames."
         )
-    power = float(good.square().mean()) - noise if len(good) else 0.0
+    power = float(good @ good) / len(good) - noise if len(good) else 0.0
     if power <= noise:
         raise InputError(
             "The frame is dark: its signal does not rise above the noise; expose longer, open the "

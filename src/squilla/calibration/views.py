@@ -1,6 +1,7 @@
 """The sub-images of a frame: cut out, corrected, evened."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -28,6 +29,11 @@ class SubImages:
     offset: np.ndarray
     margin: int
     saturated: float
+
+    @cached_property
+    def level(self) -> np.ndarray:
+        """Mean of each unit's field, (M,) float32, DN."""
+        return inner(self.image, self.margin).mean((1, 2)).numpy()
 
 
 def sub_images(raw: Raw, lattice: Lattice, pixels: Pixels, margin: int) -> SubImages:
@@ -87,20 +93,32 @@ def fill(image, bad):
     that stands out of its neighbours twofold is a defect, for a lens spreads every point.
     """
     units, rows, columns = image.shape
-    for unit in numba.prange(units):
-        for row in range(rows):
-            for column in range(columns):
-                if not bad[unit, row, column]:
-                    continue
-                total, count = 0.0, 0
-                for y in range(max(row - 1, 0), min(row + 2, rows)):
-                    for x in range(max(column - 1, 0), min(column + 2, columns)):
-                        if not bad[unit, y, x]:
-                            total += image[unit, y, x]
-                            count += 1
-                if count:
-                    mean, own = np.float32(total / count), image[unit, row, column]
-                    image[unit, row, column] = own if mean < own < 2 * mean else mean
+    for line in numba.prange(units * rows):
+        unit, row = line // rows, line % rows
+        count = 0
+        for column in range(columns):  # most lines are good, which a vector loop tells at once
+            count += bad[unit, row, column]
+        column = 0
+        while count:
+            if bad[unit, row, column]:
+                fill_one(image[unit], bad[unit], row, column)
+                count -= 1
+            column += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_one(image, bad, row, column):
+    """Do what `fill` does for one pixel of one picture."""
+    rows, columns = image.shape
+    total, count = 0.0, 0
+    for y in range(max(row - 1, 0), min(row + 2, rows)):
+        for x in range(max(column - 1, 0), min(column + 2, columns)):
+            if not bad[y, x]:
+                total += image[y, x]
+                count += 1
+    if count:
+        mean, own = np.float32(total / count), image[row, column]
+        image[row, column] = own if mean < own < 2 * mean else mean
 
 
 def windows(image: np.ndarray, lattice: Lattice, margin: int) -> tuple[np.ndarray, np.ndarray]:
@@ -145,7 +163,7 @@ def evened(views: SubImages, lattice: Lattice, calibration: Calibration) -> SubI
     response = calibration.mean_sensitivity.double().numpy()
     gram = response @ response.T
     gram += 1e-3 * np.trace(gram) / len(gram) * np.eye(len(gram))
-    level = inner(views.image, views.margin).mean((1, 2)).double().numpy()
+    level = views.level.astype(float)
     spectrum = response.T @ np.linalg.solve(gram, level)
     light = np.maximum(calibration.sensitivity @ spectrum, 1e-30)  # (A, M)
     share = np.clip(light / light[0], 0.5, 2)

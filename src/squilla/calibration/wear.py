@@ -15,7 +15,7 @@ import torch
 from squilla.calibration.agreement import Agreement
 from squilla.calibration.calibration import Pixels
 from squilla.calibration.stray import dark_levels
-from squilla.calibration.views import SubImages, fill, inner
+from squilla.calibration.views import SubImages, fill_one
 from squilla.files.raw import Raw
 
 _OUT = 2.5
@@ -133,24 +133,29 @@ def without_odd_pixels(views: SubImages, pixels: Pixels) -> tuple[SubImages, int
     Returns
     -------
     views : SubImages
+        The same; its arrays are changed in place.
     odd : int
         How many within the fields.
     """
-    bad = views.bad.numpy().copy()
+    image, bad = views.image.numpy(), views.bad.numpy()
     floor = np.float32((pixels.read_noise / pixels.gain) ** 2 + 1 / 12)
-    _find_odd(views.image.numpy(), views.bad.numpy(), floor, np.float32(1 / pixels.gain), bad)
-    found = bad & ~views.bad.numpy()
-    if not found.any():
-        return views, 0
-    image = views.image.numpy().copy()
-    image[found] = 0  # nothing of it is to stay
-    fill(image, bad)
-    odd = int(inner(found, views.margin).sum())
-    return replace(views, image=torch.from_numpy(image), bad=torch.from_numpy(bad)), odd
+    odd = np.zeros(bad.shape, bool)  # whose memory costs nothing where nothing is written
+    lines = np.zeros(bad.shape[:2], bool)
+    _find_odd(image, bad, floor, np.float32(1 / pixels.gain), odd, lines)
+    units, rows = np.nonzero(lines)
+    some, columns = np.nonzero(odd[units, rows])
+    places = units[some], rows[some], columns
+    if len(columns):
+        image[places], bad[places] = 0, True  # nothing of it is to stay
+        _fill_at(image, bad, *places)
+    height, width = (length - views.margin for length in bad.shape[1:])
+    within = (places[1] >= views.margin) & (places[1] < height)
+    within &= (columns >= views.margin) & (columns < width)
+    return views, int(within.sum())
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
-def _find_odd(image, bad, floor, shot, odd):
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
+def _find_odd(image, bad, floor, shot, odd, lines):
     units, rows, columns = image.shape
     for line in numba.prange(units * (rows - 2)):
         unit, row = line // (rows - 2), line % (rows - 2) + 1
@@ -159,23 +164,36 @@ def _find_odd(image, bad, floor, shot, odd):
         for x in range(columns):
             top[x], bottom[x] = max(above[x], below[x]), min(above[x], below[x])
         out = np.empty(columns, np.float32)
+        most = np.float32(0)
         for x in range(1, columns - 1):  # bad neighbours count as what they were filled with
             left, right = max(top[x - 1], here[x - 1]), max(top[x + 1], here[x + 1])
             high = max(top[x], max(left, right))
             left, right = min(bottom[x - 1], here[x - 1]), min(bottom[x + 1], here[x + 1])
             low = min(bottom[x], min(left, right))
             out[x] = max(here[x] - high, low - here[x]) - (high - low)
+            most = max(most, out[x])
+        if not most > 0:
+            continue
         for x in range(1, columns - 1):
             if out[x] > 0 and not bad[unit, row, x]:
                 noise = floor + shot * max(top[x], np.float32(0))
-                odd[unit, row, x] |= out[x] > _OUT * np.sqrt(noise)
+                if out[x] > _OUT * np.sqrt(noise):
+                    odd[unit, row, x] = lines[unit, row] = True
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_at(image, bad, units, rows, columns):
+    for number in range(len(units)):
+        unit = units[number]
+        fill_one(image[unit], bad[unit], rows[number], columns[number])
 
 
 def without_covered_units(views: SubImages) -> SubImages:
     """Mark units that show next to nothing as bad, whose noise would lead the placing astray."""
-    level = inner(views.image, views.margin).mean((1, 2))
-    covered = level < _COVERED * level.median()
-    return replace(views, bad=views.bad | covered[:, None, None]) if covered.any() else views
+    covered = views.level < _COVERED * np.median(views.level)
+    if not covered.any():
+        return views
+    return replace(views, bad=views.bad | torch.from_numpy(covered)[:, None, None])
 
 
 # --- what is told -------------------------------------------------------------------------------

@@ -31,6 +31,24 @@ class CameraInfo:
         return f"{self.vendor} {self.model} {self.serial}"
 
 
+@dataclass
+class Statistics:
+    """What became of the frames that a camera sent.
+
+    delivered : handed to the reader.
+    skipped : whole, but older than the one handed out, because the reader was slow.
+    incomplete : packets of them were lost.
+    lost : never seen: no packet came, or all buffers were full.
+    reconnected : times that the camera was lost and came back.
+    """
+
+    delivered: int = 0
+    skipped: int = 0
+    incomplete: int = 0
+    lost: int = 0
+    reconnected: int = 0
+
+
 @dataclass(frozen=True)
 class Region:
     """The part of the sensor that is read, px."""

@@ -9,12 +9,12 @@ with open_camera("genicam:Vendor-12345") as camera:
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from squilla.errors import InputError
 from squilla.files.raw import Raw
-from squilla.live.connection import Arrival, CameraInfo, CameraLost, Connection, Region
+from squilla.live.connection import Arrival, CameraInfo, CameraLost, Connection, Region, Statistics
 from squilla.live.pixel_format import FORMATS, best_format, pixel_format
 
 _SLICE = 0.05
@@ -31,24 +31,6 @@ _PAUSE = 0.2
 
 _WRAP = 65535
 """GigE Vision counts frames from 1 to 65 535 and starts again."""
-
-
-@dataclass
-class Statistics:
-    """What became of the frames that the camera sent.
-
-    delivered : handed to the reader.
-    skipped : whole, but older than the one handed out, because the reader was slow.
-    incomplete : packets of them were lost.
-    lost : never seen: no packet came, or all buffers were full.
-    reconnected : times that the camera was lost and came back.
-    """
-
-    delivered: int = 0
-    skipped: int = 0
-    incomplete: int = 0
-    lost: int = 0
-    reconnected: int = 0
 
 
 def open_camera(

@@ -42,6 +42,8 @@ class Recorder:
             _WAITING
         )
         self._thread: threading.Thread | None = None
+        self._taking = threading.Lock()  # so that nothing comes after what ends the queue
+        self._switching = threading.Lock()  # one start or stop at a time
         if self.cubes:
             need_zarr(path)
         if self.cubes and path.exists():
@@ -60,24 +62,30 @@ class Recorder:
 
     def start(self) -> None:
         """Take frames from now on."""
-        if self._thread is None:
-            self.error = None
-            self._thread = threading.Thread(target=self._run, daemon=True)
-            self._thread.start()
+        with self._switching:
+            if self._thread is None:
+                self.error = None
+                self._thread = threading.Thread(target=self._run, daemon=True)
+                self._thread.start()
 
     def stop(self) -> None:
         """Write what waits, then take no more."""
-        thread, self._thread = self._thread, None
-        if thread is not None:
-            self._waiting.put(None)
-            thread.join()
+        with self._switching:
+            with self._taking:
+                thread, self._thread = self._thread, None
+            if thread is not None:
+                self._waiting.put(None)
+                thread.join()
 
     def offer(self, raw: Raw, cube: Callable[[], DataArray]) -> None:
-        """Hand over a frame; it is missed if the disk is behind."""
-        try:
-            self._waiting.put_nowait((raw, cube))
-        except queue.Full:
-            self.missed += 1
+        """Hand over a frame; it is missed if the disk is behind, and passed over when stopped."""
+        with self._taking:
+            if self._thread is None:
+                return
+            try:
+                self._waiting.put_nowait((raw, cube))
+            except queue.Full:
+                self.missed += 1
 
     def _run(self) -> None:
         while (item := self._waiting.get()) is not None:

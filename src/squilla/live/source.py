@@ -4,15 +4,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from xarray import DataArray
 
 from squilla.camera.twin import Camera
 from squilla.errors import InputError
 from squilla.files.raw import Raw, read_raws
+from squilla.live.connection import Statistics
 from squilla.live.twin_frames import TwinFrames, views
 
 Limits = tuple[float, float] | None
@@ -23,16 +23,6 @@ EXPOSURES = (0.001, 1e5)
 
 GAINS = (0.0, 24.0)
 """Gains of the twin, dB."""
-
-
-@dataclass
-class Counts:
-    """What became of a camera's frames: handed out, too old, broken, never seen."""
-
-    delivered: int = 0
-    skipped: int = 0
-    incomplete: int = 0
-    lost: int = 0
 
 
 class FrameSource(Protocol):
@@ -68,8 +58,8 @@ class FrameSource(Protocol):
         ...
 
     @property
-    def statistics(self) -> Any:
-        """`Counts`, or what has the same fields."""
+    def statistics(self) -> Statistics:
+        """What became of the frames so far."""
         ...
 
     def check_size(self, shape: tuple[int, int]) -> None:
@@ -102,7 +92,7 @@ class FolderFrames:
 
     def __init__(self, path: Path, *, rate: float = 10.0):
         self._path, self._clock = path, _Clock(rate)
-        self.statistics, self.report = Counts(), say
+        self.statistics, self.report = Statistics(), say
         self._frames = read_raws(path)
         self._next: Raw | None = next(self._frames)  # what cannot be read is said at once
         self._exposure = self._next.exposure
@@ -181,7 +171,7 @@ class MovingTwin:
         seed: int = 0,
     ):
         self._clock = _Clock(rate)
-        self.statistics, self.report = Counts(), say
+        self.statistics, self.report = Statistics(), say
         self._poses = views(camera, scene, distance, moving=True)
         self._frames = TwinFrames(camera, [next(self._poses)], seed)
         self._bits = camera.design.sensor.bits

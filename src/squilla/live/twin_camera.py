@@ -172,12 +172,17 @@ class TwinCamera:
             address.encode(), serial, str(description()).encode()
         )
         self._simulator = made
-        if not self._lib.arv_gv_fake_camera_is_running(made):
-            self._lib.g_object_unref(made)
-            raise InputError(f"This machine has no network interface with the address {address}.")
-        aravis.set_property(made, "gvsp-lost-ratio", float(lost))
-        inner = self._lib.arv_gv_fake_camera_get_fake_camera(made)
-        self._simulation = Simulation(inner, frames, rate)
+        try:
+            if not self._lib.arv_gv_fake_camera_is_running(made):
+                raise InputError(
+                    f"This machine has no network interface with the address {address}."
+                )
+            aravis.set_property(made, "gvsp-lost-ratio", float(lost))
+            inner = self._lib.arv_gv_fake_camera_get_fake_camera(made)
+            self._simulation = Simulation(inner, frames, rate)
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def sent(self) -> int:
@@ -216,8 +221,12 @@ def camera_within(frames: TwinFrames, *, rate: float = 5.0) -> Iterator[LiveCame
         connection = aravis.AravisConnection("Fake_1")
     finally:
         lib.arv_disable_interface(b"Fake")  # nobody else is to find it
-    inner = lib.arv_fake_device_get_fake_camera(connection.device)
-    simulation = Simulation(inner, frames, rate)
+    try:
+        inner = lib.arv_fake_device_get_fake_camera(connection.device)
+        simulation = Simulation(inner, frames, rate)
+    except BaseException:
+        connection.close()
+        raise
     with LiveCamera(lambda: connection, None, 0.0, None) as camera:
         yield camera
     if simulation.failure is not None:

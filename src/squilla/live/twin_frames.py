@@ -140,10 +140,10 @@ def views(
         yield camera.rate(scene, distance=distance)
         return
     for swing in np.sin(np.linspace(-np.pi / 2, np.pi / 2, POSES)):
-        yield camera.rate(_moved(scene, float(swing)), distance=distance * (1 - 0.15 * swing))
+        yield camera.rate(moved(scene, float(swing)), distance=distance * (1 - 0.15 * swing))
 
 
-def _moved(scene: DataArray, swing: float) -> DataArray:
+def moved(scene: DataArray, swing: float) -> DataArray:
     """Return a scene turned and shifted by its place in the swing, -1..1; its edges reflect it."""
     import torch
     from torch.nn.functional import affine_grid, grid_sample

@@ -15,15 +15,17 @@ from torch import Tensor
 
 from squilla.reconstruction.compiled import (
     ONE,
-    add_product,
     compiled,
     inherited,
-    mix,
     over_rows,
     sigmoid,
+    times,
 )
 from squilla.reconstruction.engine import Network
-from squilla.reconstruction.evidence import SPECTRAL, Evidence
+from squilla.reconstruction.evidence import CORRECTED, SPECTRAL, Evidence
+from squilla.threads import single_threaded_products
+
+_CHANGED = CORRECTED[0]
 
 
 @compiled
@@ -113,17 +115,20 @@ def _fine_changes(
 def _decoded(first, last, kin, spectra, changes, basis, bright, cube):
     """Write non-negative spectra: those of the four coarse cells mixed, changed, and bright."""
     below, right = spectra.shape[0] - 1, spectra.shape[1] - 1
-    bands, whole = cube.shape[2], basis.shape[1]
-    line = np.empty(whole, np.float32)
     for row in range(first, last):
         up, down = max((row - 1) // 2, 0), min((row + 1) // 2, below)
         for column in range(cube.shape[1]):
             before, after = max((column - 1) // 2, 0), min((column + 1) // 2, right)
-            mix(kin[row, column], spectra, up, down, before, after, line, whole)
-            add_product(changes[row, column], basis, line)
+            a, b = spectra[up, before], spectra[up, after]
+            c, d = spectra[down, before], spectra[down, after]
+            share, change = kin[row, column], changes[row, column]
+            p, q, r, s = share[0], share[1], share[2], share[3]
             spectrum, factor = cube[row, column], bright[row, column]
-            for k in range(bands):
-                spectrum[k] = factor * max(line[k], np.float32(0))
+            for k in range(spectrum.size):
+                value = p * a[k] + q * b[k] + r * c[k] + s * d[k]
+                for i in range(_CHANGED):  # a constant: unrolled, and kept in registers
+                    value += change[i] * basis[i, k]
+                spectrum[k] = factor * max(value, np.float32(0))
 
 
 # --- all of it ----------------------------------------------------------------------------------
@@ -145,18 +150,19 @@ class Coded:
     changes: np.ndarray
     bright: np.ndarray
 
+    @single_threaded_products()
     def spell_out(self, basis: np.ndarray, threads: int) -> np.ndarray:
         """Return spectra, (h, w, K), in a basis (C, K), of all bands or of some."""
         bands = basis.shape[1]
         whole = np.zeros((len(basis), bands + -bands % 16), np.float32)  # full vector registers
         whole[:, :bands] = basis
-        spectra = self.coarse.reshape(-1, len(basis)) @ whole
-        spectra = spectra.reshape(*self.coarse.shape[:2], -1)
+        spectra = np.empty((*self.coarse.shape[:2], whole.shape[1]), np.float32)
+        over_rows(times, len(spectra), threads, self.coarse, whole, spectra)
         # NumPy, other than torch, asks for huge pages: four times as fast where memory is new.
         cube = np.empty((*self.bright.shape, bands), np.float32)
         over_rows(
             _decoded, len(cube), threads, self.kin, spectra, self.changes,
-            whole[: self.changes.shape[-1]], np.ascontiguousarray(self.bright), cube,
+            whole[:_CHANGED], np.ascontiguousarray(self.bright), cube,
         )  # fmt: skip
         return cube
 

@@ -28,6 +28,7 @@ from squilla.reconstruction.evidence import (
     Evidence,
 )
 from squilla.reconstruction.prior import LEADING
+from squilla.threads import single_threaded_products
 
 compiled = numba.njit(
     fastmath={"reassoc", "contract", "nsz", "arcp"},
@@ -36,6 +37,9 @@ compiled = numba.njit(
     cache=True,
 )
 ONE, _HALF, _MODEL = np.float32(1), np.float32(0.5), np.float32(MODEL_NOISE)
+_ROWS = 16
+"""Rows of a picture that are worked on at a time where a step leaves something to the next."""
+
 _LIKELY = np.float32(1e-6)
 """Clusters less likely than this leave no trace in a posterior."""
 
@@ -97,11 +101,11 @@ def sigmoid(x):
 def _light(first, last, y, known):
     for row in range(first, last):
         for column in range(y.shape[1]):
-            pixel, most, total = y[row, column], np.float32(0), np.float32(0)
+            pixel, lit, total = y[row, column], 0, np.float32(0)
             for i in range(pixel.size):
-                most = max(most, pixel[i])
+                lit += pixel[i] > 0
                 total += pixel[i] * 0  # NaN if anything is not finite
-            known[row, column] = total + (ONE if most > 0 else np.float32(0))
+            known[row, column] = total + (ONE if lit else np.float32(0))
 
 
 @compiled
@@ -114,11 +118,10 @@ def _quiet_steps(first, last, y, ratio, flat, quiet, expected, steps):
         for column in range(width):
             pixel = y[2 * row, column]
             now, then = seen[column % 2], seen[1 - column % 2]
-            amplitude, power = np.float32(0), np.float32(0)
+            power = np.float32(0)
             for i in range(channels):
-                amplitude += pixel[i] * flat[i]
                 power += pixel[i] * pixel[i]
-            amplitude = max(amplitude, np.float32(1e-30))
+            amplitude = max(_amplitude(pixel, flat), np.float32(1e-30))
             now[:] = 0
             add_product(pixel, quiet, now)
             for i in range(now.size):
@@ -134,6 +137,22 @@ def _quiet_steps(first, last, y, ratio, flat, quiet, expected, steps):
 
 
 @compiled
+def _amplitude(pixel, flat):
+    total = np.float32(0)
+    for i in range(flat.size):
+        total += pixel[i] * flat[i]
+    return total
+
+
+@compiled
+def _brightness(first, last, y, flat, total):
+    for row in range(first, last):
+        total[row] = 0
+        for column in range(y.shape[1]):
+            total[row] += abs(_amplitude(y[row, column], flat))
+
+
+@compiled
 def _normalised(first, last, projected, ratio, factor, floor, channels, view):
     """Write shape, amplitude and noise of pixels; beyond the picture nothing is known."""
     height, width = ratio.shape
@@ -143,14 +162,21 @@ def _normalised(first, last, projected, ratio, factor, floor, channels, view):
             cell[0], cell[1], cell[2:] = np.float32(1e6), floor, np.float32(0)
             if row >= height or column >= width:
                 continue
-            pixel = projected[row, column]
+            pixel = projected[row - first, column]
             cell[1] = max(pixel[-1], floor)
-            power = np.float32(0)
+            power, unit = np.float32(0), ONE / cell[1]
             for i in range(pixel.size - 1):
-                cell[2 + i] = pixel[i] / cell[1]
+                cell[2 + i] = pixel[i] * unit
                 power += cell[2 + i] * cell[2 + i]
             noise = ratio[row, column] * factor * max(power / channels, np.float32(1e-6))
             cell[0] = min(max(noise, np.float32(1e-9)), np.float32(1e6))
+
+
+def _viewed(first: int, last: int, y: np.ndarray, project: np.ndarray, *arguments) -> None:
+    """Project pixels and write their view, a few rows at a time, which the caches hold."""
+    for start in range(first, last, _ROWS):
+        stop = min(start + _ROWS, last)
+        _normalised(start, stop, y[start:stop] @ project, *arguments)
 
 
 @compiled
@@ -262,13 +288,38 @@ def _besides_itself(first, last, alone, known, mixed):
 
 
 @compiled
-def _divided(first, last, score, view, zone, power):
+def _zoned(first, last, view, zone, matrices, product):
+    """Multiply the shape of every cell by the matrix of its zone: a run of one zone at a time."""
+    width = view.shape[1]
+    shape = np.empty((width, matrices.shape[1]), np.float32)
     for row in range(first, last):
-        for column in range(score.shape[1]):
-            cell, spread = score[row, column], power[zone[row, column]]
-            noise = view[row, column, 0] + _MODEL
-            for i in range(cell.size):
-                cell[i] /= spread[i] + noise
+        start = 0
+        while start < width:
+            where, stop = zone[row, start], start
+            while stop < width and zone[row, stop] == where:
+                shape[stop] = view[row, stop, 2:]
+                stop += 1
+            np.dot(shape[start:stop], matrices[where], product[row][start:stop])
+            start = stop
+
+
+@compiled
+def _wiener(first, last, view, zone, vectors, power, gain, own):
+    """Write the linear estimate of `Estimators.wiener`, as many coefficients as `own` has."""
+    score = np.empty((1, view.shape[1], vectors.shape[2]), np.float32)
+    for row in range(first, last):
+        here, places = view[row : row + 1], zone[row : row + 1]
+        _zoned(0, 1, here, places, vectors, score)
+        start = 0
+        while start < view.shape[1]:
+            where, stop = zone[row, start], start
+            while stop < view.shape[1] and zone[row, stop] == where:
+                cell, noise = score[0, stop], view[row, stop, 0] + _MODEL
+                for i in range(cell.size):
+                    cell[i] /= power[where, i] + noise
+                stop += 1
+            np.dot(score[0][start:stop], gain[where], own[row][start:stop])
+            start = stop
 
 
 @compiled
@@ -341,13 +392,14 @@ class CompiledCamera:
         clusters = len(zones[0].cluster_power)
 
         def stacked(name: str) -> np.ndarray:
-            return np.stack([getattr(zone, name).numpy() for zone in zones])
+            return np.ascontiguousarray(np.stack([getattr(zone, name) for zone in zones]))
 
         self.channels = np.float32(camera.channels)
         self.project = camera.project.numpy()
         self.flat = np.ascontiguousarray(camera.project[:, -1].numpy())
         self.quiet, self.power = np.ascontiguousarray(camera.quiet.numpy()), camera.power.numpy()
-        self.vectors, self.spread, self.gain = map(stacked, ("vectors", "power", "gain"))
+        self.vectors, self.spread, gain = map(stacked, ("vectors", "power", "gain"))
+        self.gains = [np.ascontiguousarray(gain[..., :size]) for size in CORRECTED]
         self.scores = stacked("scores")
         within = stacked("within")
         self.mixture = (
@@ -381,6 +433,7 @@ def noise_factor(y: np.ndarray, ratio: np.ndarray, camera: CompiledCamera, threa
     return float(np.clip(factor, 0.05, 20.0))
 
 
+@single_threaded_products()
 def gather_evidence(
     y: np.ndarray,
     ratio: np.ndarray,
@@ -405,7 +458,7 @@ def gather_evidence(
     """
     step = 2**LEVELS
     sides = tuple(side + -side % step for side in ratio.shape)
-    size = camera.vectors.shape[1]
+    size, basis = camera.vectors.shape[1], camera.mixture[2].shape[-1]
 
     def run(kernel: Callable[..., None], rows: int, *arguments) -> None:
         over_rows(kernel, rows, threads, *arguments)
@@ -414,10 +467,11 @@ def gather_evidence(
         return np.empty((sides[0] >> level, sides[1] >> level, *last), np.float32)
 
     views = [empty(level, size + 2) for level in range(LEVELS + 1)]
-    projected = (y.reshape(-1, y.shape[-1]) @ camera.project).reshape(*ratio.shape, -1)
-    floor = 1e-3 * np.abs(projected[..., -1]).sum(dtype=float) / (sides[0] * sides[1])
+    bright = np.empty(len(y), np.float32)
+    run(_brightness, len(y), y, camera.flat, bright)
+    floor = 1e-3 * bright.sum(dtype=float) / (sides[0] * sides[1])
     told = np.float32(factor), np.float32(max(floor, 1e-30)), camera.channels
-    run(_normalised, sides[0], projected, ratio, *told, views[0])
+    run(_viewed, sides[0], y, camera.project, ratio, *told, views[0])
     for level in range(1, LEVELS + 1):
         run(_coarser, len(views[level]), views[level - 1], views[level])
     known = [views[0]]
@@ -440,18 +494,18 @@ def gather_evidence(
             spectral = best
 
     places = [_zones(zone, sides, level) for level in range(SPECTRAL + 1)]
-    coefficients = empty(SPECTRAL, camera.gain.shape[-1])
+    coefficients = empty(SPECTRAL, basis)
     variance, features = np.empty_like(coefficients), empty(SPECTRAL, 2)
-    place = places[SPECTRAL]
+    place, scores = places[SPECTRAL], empty(SPECTRAL, camera.scores.shape[-1])
+    run(_zoned, len(spectral), spectral, place, camera.scores, scores)
     run(
-        _mixture, len(spectral), _product(spectral[..., 2:], camera.scores, place), spectral,
+        _mixture, len(spectral), scores, spectral,
         place, *camera.mixture, coefficients, variance, features,
     )  # fmt: skip
-    own = []
+    own = [empty(level, CORRECTED[level]) for level in range(SPECTRAL)]
     for level, (view, place) in enumerate(zip(known[:SPECTRAL], places, strict=False)):
-        score = _product(view[..., 2:], camera.vectors, place)
-        run(_divided, len(view), score, view, place, camera.spread)
-        own.append(_product(score, camera.gain[..., : CORRECTED[level]], place))
+        matrices = camera.vectors, camera.spread, camera.gains[level]
+        run(_wiener, len(view), view, place, *matrices, own[level])
 
     def pictures(values: Iterable[np.ndarray]) -> list[Tensor]:
         return [torch.from_numpy(value)[None] for value in values]
@@ -481,16 +535,9 @@ def _zones(zone: np.ndarray | None, sides: tuple[int, ...], level: int) -> np.nd
     return filled[2**level // 2 :: 2**level, 2**level // 2 :: 2**level]
 
 
-def _product(picture: np.ndarray, matrices: np.ndarray, zone: np.ndarray) -> np.ndarray:
-    """Multiply every cell by the matrix of its zone."""
-    if len(matrices) == 1:
-        flat = picture.reshape(-1, picture.shape[-1]) @ matrices[0]
-        return flat.reshape(*zone.shape, -1)
-    product = np.empty((*zone.shape, matrices.shape[-1]), np.float32)
-    for number, matrix in enumerate(matrices):
-        cells = zone == number
-        product[cells] = picture[cells] @ matrix
-    return product
+def times(first: int, last: int, picture: np.ndarray, matrix: np.ndarray, product: np.ndarray):
+    """Multiply every cell of some rows by a matrix."""
+    np.matmul(picture[first:last], matrix, out=product[first:last])
 
 
 def over_rows(kernel: Callable[..., None], rows: int, threads: int, *arguments) -> None:

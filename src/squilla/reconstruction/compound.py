@@ -324,21 +324,23 @@ class Compound(Reconstructor):
         A channel that most pixels lack is left out of the camera; what single pixels lack is
         filled by the linear estimate from their other channels.
         """
-        from squilla.reconstruction.linear import complete
+        from squilla.reconstruction.linear import complete, counted
 
         y = torch.as_tensor(measurement.y, dtype=torch.float32)
         y, angle, snr = self._accepted(picture(y), measurement.angle, measurement.snr)
         valid = torch.as_tensor(measurement.valid, dtype=torch.bool)
-        if valid.all() and y.sum().isfinite():  # nothing is missing, as nearly always
+        count = counted(y, valid).numpy()
+        enough = count >= (y.shape[-1] + 1) // 2
+        if 2 * np.sum(count == y.shape[-1]) >= np.sum(enough):  # no channel lacks most pixels
+            y = complete(y, valid, self.calibration, angle, snr)
             return y.to(self.basis.device), angle, snr, (True,) * y.shape[-1]
-        valid = valid & y.isfinite()
-        enough = valid.sum(-1) >= (y.shape[-1] + 1) // 2
-        channels = valid[enough].float().mean(0) >= 0.5
+        valid, enough = valid & y.isfinite(), torch.from_numpy(enough)
+        kept = valid[enough].float().mean(0) >= 0.5
         known = self.calibration
-        part = Calibration(known.wavelength, known.sensitivity[:, channels], known.angle)
-        y = complete(y[..., channels], valid[..., channels], part, angle, snr)
+        part = Calibration(known.wavelength, known.sensitivity[:, kept], known.angle)
+        y = complete(y[..., kept], valid[..., kept], part, angle, snr)
         y = torch.where(enough[..., None], y, torch.nan).to(self.basis.device)
-        return y, angle, snr, tuple(channels.tolist())
+        return y, angle, snr, tuple(kept.tolist())
 
     def _camera(self, channels: tuple[bool, ...] | None, zoned: bool) -> Camera:
         """Return the front end for some of the channels, (M,), with the mean angle or in zones."""
@@ -399,11 +401,14 @@ class Compound(Reconstructor):
         channels: tuple[bool, ...] | None,
     ) -> tuple[Camera, Tensor, Tensor | None]:
         """Return the camera, and of each pixel the noise over the signal and its zone."""
-        ratio = 10 ** (-(y.new_tensor(UNKNOWN) if snr is None else snr).clamp_max(60) / 10)
+        stated = UNKNOWN if snr is None else snr.cpu().numpy()
+        ratio = np.float32(10) ** (np.minimum(stated, np.float32(60)) / np.float32(-10))
+        ratio = torch.as_tensor(ratio, dtype=torch.float32).to(y.device)
         zone = None
         if angle is not None:
-            middles = self._middles().to(y.device)
-            zone = torch.bucketize(angle.square(), (middles[1:] + middles[:-1]) / 2)
+            middles = self._middles().numpy()
+            place = np.searchsorted((middles[1:] + middles[:-1]) / 2, angle.cpu().numpy() ** 2)
+            zone = torch.as_tensor(place).to(y.device)
         return self._camera(channels, angle is not None), ratio.expand(y.shape[:-1]), zone
 
     def _pictures(

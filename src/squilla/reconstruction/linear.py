@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from copy import copy
 
+import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -140,31 +141,53 @@ def complete(
             f"The valid mask has the shape {tuple(valid.shape)}, the measurement "
             f"{tuple(y.shape)}; they must agree."
         )
-    if not y.sum().isfinite():
-        valid = valid & y.isfinite()
-    count = valid.sum(-1)
+    count = counted(y, valid)
+    if (count == y.shape[-1]).all():
+        return y
     enough = count >= (y.shape[-1] + 1) // 2
     partial = enough & (count < y.shape[-1])
-    filled = torch.where(enough[..., None], y, torch.nan)
+    filled = y.clone()
+    filled[~enough] = torch.nan
     if not partial.any():
         return filled
-    response = calibration.sensitivities.double() if angle is not None else None
-    if response is None:
+    if angle is None:
         response = calibration.mean_sensitivity.double()[None]
-    covariance = (
-        (response @ second_moment(calibration.wavelength) @ response.mT).float().to(y.device)
-    )
-    known = torch.where(valid, y, 0)[partial]
+        covariance = response @ second_moment(calibration.wavelength) @ response.mT
+    else:
+        covariance = calibration.usual_moments
+    covariance = covariance.float().to(y.device)
+    known, valid = y[partial], valid[partial]
+    valid = valid & known.isfinite()
+    known = torch.where(valid, known, 0)
     noise = _noise_to_signal(None if snr is None else snr[partial], len(known), y.device)
     weights = torch.ones(len(known), 1, device=y.device)
     if angle is not None:
         weights = calibration.angle_weights(angle[partial])
     parts = [
-        _fill(known[some], valid[partial][some], weights[some], noise[some], covariance)
+        _fill(known[some], valid[some], weights[some], noise[some], covariance)
         for some in torch.arange(len(known), device=y.device).split(2048)
     ]
     filled[partial] = torch.cat(parts)
     return filled
+
+
+def counted(y: Tensor, valid: Tensor) -> Tensor:
+    """Return how many channels of each pixel, (..., M), are valid and finite, (...) int32."""
+    if y.device.type != "cpu":
+        return (valid & y.isfinite()).sum(-1, dtype=torch.int32)
+    count = np.empty(y.shape[:-1], np.int32)
+    flat = y.detach().reshape(-1, y.shape[-1]).numpy()
+    _count(flat, valid.reshape(-1, y.shape[-1]).numpy(), count.reshape(-1))
+    return torch.from_numpy(count)
+
+
+@numba.njit(cache=True, nogil=True)
+def _count(y, valid, count):
+    for place in range(len(y)):
+        total = 0
+        for unit in range(y.shape[1]):
+            total += valid[place, unit] & (y[place, unit] * 0 == 0)
+        count[place] = total
 
 
 def _fill(y: Tensor, valid: Tensor, weights: Tensor, noise: Tensor, covariance: Tensor) -> Tensor:

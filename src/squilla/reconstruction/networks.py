@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import max_pool1d, pad, relu
+from torch.nn.functional import conv2d, linear, max_pool1d, pad, relu
 
 from squilla.calibration.calibration import Calibration
 from squilla.reconstruction.reconstructor import Reconstructor
@@ -163,6 +163,30 @@ class ReSpecNN(Reconstructor):
         for layer in self.layers:
             x = relu(layer(x))
         return torch.sigmoid(self.gather(x.flatten(1)))
+
+    def for_engines(self) -> nn.Module:
+        return _Picture(self)
+
+
+class _Picture(nn.Module):
+    """`ReSpecNN` with the pixels as rows of one picture, and channels last in the dense layer.
+
+    A few large convolutions take an engine less time than many small ones.
+    """
+
+    def __init__(self, network: ReSpecNN):
+        super().__init__()
+        self.network = network
+        weight = network.gather.weight.detach()
+        self.gather = weight.unflatten(1, (-1, len(weight))).mT.flatten(1).contiguous()
+
+    def forward(self, y: Tensor) -> Tensor:
+        x = self.network.spread(y)[None, None]
+        for layer in self.network.layers:
+            assert isinstance(layer, nn.Conv1d)
+            x = relu(conv2d(x, layer.weight[:, :, None], layer.bias, padding=(0, 1)))
+        x = x.permute(0, 2, 3, 1)[0].flatten(1)
+        return torch.sigmoid(linear(x, self.gather, self.network.gather.bias))
 
 
 class ResidualBlock(nn.Module):

@@ -115,7 +115,9 @@ class Reconstructor(nn.Module):
         if y.numel() == 0:
             return y.new_zeros(*pixels, len(self.wavelength))
         y = y.reshape(-1, y.shape[-1])
-        piece = self.piece * (1 if y.device.type == "cpu" else 32)  # a GPU has to be filled
+        # A GPU has to be filled; threads of an engine and of PyTorch should not take short turns.
+        alone = y.device.type == "cpu" and self._network is None
+        piece = self.piece * (1 if alone else 32)
         parts = [
             self._piece(y[some], None if angle is None else angle.reshape(-1)[some],
                         None if snr is None else snr.reshape(-1)[some], scale)
@@ -133,8 +135,9 @@ class Reconstructor(nn.Module):
         if self._network is None:
             x = self.estimate(seen, angle, snr).clamp_min(0)
         else:  # a network; compiled for pieces of one size
-            filled = nn.functional.pad(seen, (0, 0, 0, self.piece - len(seen))).cpu().numpy()
-            x = torch.from_numpy(self._network(filled))[: len(seen)].to(y).clamp_min(0)
+            filled = nn.functional.pad(seen, (0, 0, 0, -len(seen) % self.piece)).cpu().numpy()
+            found = [self._network(part) for part in np.split(filled, len(filled) // self.piece)]
+            x = torch.from_numpy(np.concatenate(found))[: len(seen)].to(y).clamp_min(0)
         factor = torch.where(finite, torch.where(lit, peak, 0), torch.nan)
         if self.trained and scale == "consistent":
             factor = factor * consistent_scale(y, x, self.calibration, angle)
@@ -176,7 +179,11 @@ class Reconstructor(nn.Module):
 
     def _take(self, engine: str) -> None:
         """Compile the networks for an engine."""
-        self._network = None if engine == "torch" else compile_network(Estimate(self), engine)
+        self._network = None if engine == "torch" else compile_network(self.for_engines(), engine)
+
+    def for_engines(self) -> nn.Module:
+        """Return what `estimate` does of measurements alone, in the form that engines like best."""
+        return Estimate(self)
 
     def export(self, path: str | Path) -> None:
         """Write the network as an ONNX file, for any number of pixels at once.
@@ -377,7 +384,7 @@ def _per_pixel(value: Tensor | float | None, y: Tensor, what: str) -> Tensor | N
             f"The {what} have the shape {tuple(value.shape)}, but the measurement has the pixels "
             f"{tuple(y.shape[:-1])}; give one per pixel, or one for all."
         )
-    if not value.isfinite().all():
+    if not np.isfinite(value.detach().cpu().numpy()).all():
         raise InputError(f"The {what} hold NaN or infinite values; give finite numbers.")
     return value
 
