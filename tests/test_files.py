@@ -571,6 +571,23 @@ def _damage(samples: Path, folder: Path, name: str, damaged: bytes) -> Raw | xr.
     return (read_raw if name.startswith("f") else read_scene)(folder / name)
 
 
+def test_an_empty_file_is_called_empty(tmp_path):
+    for name, read in (("c.nc", read_scene), ("c.nc", load_cube), ("f.tiff", read_raw)):
+        (tmp_path / name).touch()
+        with pytest.raises(InputError, match=f"{name} is empty"):
+            read(tmp_path / name)
+    (tmp_path / "c.nc").write_text("something else")
+    with pytest.raises(InputError, match="signature not found") as caught:
+        load_cube(tmp_path / "c.nc")
+    assert "install" not in str(caught.value)
+
+
+def test_netcdf_3_is_read(tmp_path):
+    cube = labelled(np.random.default_rng(3).random((3, 4, 3)), WAVELENGTH[:3])
+    cube.to_dataset().to_netcdf(tmp_path / "old.nc", engine="scipy")
+    np.testing.assert_array_equal(load_cube(tmp_path / "old.nc"), cube)
+
+
 @pytest.mark.parametrize("name", DAMAGED)
 @pytest.mark.parametrize("share", [0, 0.1, 0.5, 0.9])
 def test_cut_short_is_refused(samples, tmp_path, name, share):
