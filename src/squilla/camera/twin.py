@@ -18,6 +18,7 @@ from squilla.camera.blur import Blur, shift
 from squilla.camera.design import CameraDesign
 from squilla.camera.sensor import ImageSensor
 from squilla.errors import InputError
+from squilla.files.cube import labelled
 from squilla.files.raw import Raw
 from squilla.optics.filters import FilterArray
 from squilla.optics.tables import MeasuredFilters
@@ -240,12 +241,8 @@ class Camera:
         values = self._values(scene)
         size = self.design.field.size
         rows, columns = (_middle(size, length) for length in values.shape[:2])
-        cube = DataArray(
-            values[np.ix_(rows, columns)],
-            dims=("y", "x", "wavelength"),
-            coords={"wavelength": ("wavelength", self.design.wavelength, {"units": "nm"})},
-            attrs=scene.attrs,
-        )
+        seen = values[np.ix_(rows, columns)]
+        cube = labelled(seen, self.design.wavelength, attributes=scene.attrs)
         far = self.design.array.pitch / 1000 * self.design.focal
         plane = np.full(values.shape[:2], distance) if depth is None else np.asarray(depth)
         return Truth(cube, far / plane[np.ix_(rows, columns)], self.design.centres)

@@ -10,7 +10,7 @@ import typer
 from squilla.errors import InputError
 
 app = typer.Typer(
-    help="Try every combination of settings; a run that was interrupted goes on where it was.",
+    help="Try every combination of settings, on all cores.",
     no_args_is_help=True,
 )
 
