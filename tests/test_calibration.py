@@ -130,6 +130,12 @@ def test_a_saturated_step_is_left_out(camera):
         rehearsal.calibrate(sweep=sweep)
 
 
+def test_a_single_shot_is_not_passed_over(camera):
+    rehearsal = Rehearsal(camera, frames=2, step=50.0, bandwidth=50.0)
+    with pytest.raises(InputError, match="One hand-held shot"):
+        rehearsal.calibrate(target=None, target_distance=None, shots=[rehearsal.target()])
+
+
 def test_either_a_sweep_or_known_scenes(design):
     with pytest.raises(InputError, match="either"):
         calibrate(design, dark=[], flat=[])

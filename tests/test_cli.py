@@ -9,13 +9,14 @@ import sys
 import numpy as np
 import pytest
 import tifffile
+import xarray as xr
 from typer.testing import CliRunner
 
 from squilla.calibration.lessons import read_known, read_sweep
 from squilla.camera.design import design_path
 from squilla.cli.app import app
 from squilla.errors import InputError
-from squilla.files.cube import load_cube
+from squilla.files.cube import load_cube, open_cube
 from squilla.files.depth import read_depth
 
 SMALL = {
@@ -75,6 +76,38 @@ def test_from_raw_frame_to_verdict(bench, tmp_path):
     assert metrics == json.loads((tmp_path / "verdict" / "metrics.json").read_text())
     assert metrics["gfc"] > 0.9
     assert "<html" in (tmp_path / "verdict" / "report.html").read_text()
+
+
+def test_an_interval_is_saved_beside_its_cube(bench, tmp_path):
+    asked = "reconstruct", bench / "raw.tiff", "--calibration", bench / "camera.nc"
+    for name in ("plain.nc", "told.nc", "told.zarr", "told.hdr"):
+        interval = [] if name == "plain.nc" else ["--interval"]
+        run(*asked, "--model", "compound", *interval, "-o", tmp_path / name)
+    plain, layers = open_cube(tmp_path / "plain.nc")
+    assert "uncertainty" not in layers
+    for name in ("told.nc", "told.zarr", "told.hdr"):
+        cube, layers = open_cube(tmp_path / name)
+        np.testing.assert_allclose(cube, plain, rtol=1e-3, atol=1e-4)
+        width = layers["uncertainty"]
+        assert width.dims == ("y", "x", "wavelength")
+        assert (width > 0).all()
+        assert "90 %" in width.attrs["long_name"]
+    truth = load_cube(bench / "truth.nc").values
+    inside = np.abs(cube.values - truth) <= width.values
+    assert inside[20:-20, 20:-20].mean() > 0.5
+
+
+def test_many_captures_have_their_intervals_too(bench, tmp_path):
+    for name in ("a.tiff", "b.tiff"):
+        (tmp_path / name).write_bytes((bench / "raw.tiff").read_bytes())
+    run(
+        "reconstruct", tmp_path / "a.tiff", tmp_path / "b.tiff", "--calibration",
+        bench / "camera.nc", "--model", "compound", "--interval", "--workers", 1,
+        "-o", tmp_path / "both.zarr",
+    )  # fmt: skip
+    both = xr.open_zarr(tmp_path / "both.zarr", consolidated=False)
+    assert both.uncertainty.dims == ("capture", "y", "x", "wavelength")
+    np.testing.assert_array_equal(both.uncertainty[0], both.uncertainty[1])
 
 
 def test_a_chart_and_lamps_instead_of_a_sweep(bench, tmp_path):
@@ -221,6 +254,7 @@ BAD = {
     "infinitely far": RECONSTRUCT + " {b}/raw.tiff --distance inf",
     "no such model": RECONSTRUCT + " {b}/raw.tiff --model magic",
     "a model of another camera": RECONSTRUCT + " {b}/raw.tiff --model mlp",
+    "an interval of no kind": RECONSTRUCT + " {b}/raw.tiff --interval",
     "many into a file": RECONSTRUCT + " {b}/raw.tiff {b}/raw.tiff",
     "foreign calibration": "reconstruct {b}/raw.tiff --calibration {b}/truth.nc -o {t}/c.nc",
     "unknown cube suffix": "reconstruct {b}/raw.tiff --calibration {b}/camera.nc -o {t}/c.doc",

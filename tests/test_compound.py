@@ -8,6 +8,7 @@ from scipy.stats import multivariate_normal, norm
 from random_camera import smooth_camera
 from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
+from squilla.errors import InputError
 from squilla.priors import natural_spectra
 from squilla.reconstruction.compound import Compound
 from squilla.reconstruction.evidence import (
@@ -23,7 +24,7 @@ from squilla.reconstruction.evidence import (
 from squilla.reconstruction.models import load_model
 from squilla.reconstruction.prior import Estimators, Prior, broad_prior, fit_mixture
 from squilla.spectra import CHART_LIGHT, grid, lights
-from squilla.training.compound import Recipe, Studio, misaligned, train_compound
+from squilla.training.compound import Recipe, Studio, from_checkpoint, misaligned, train_compound
 from squilla.training.noise import add_noise
 from squilla.training.scenes import Palette, draw_scenes
 
@@ -322,3 +323,10 @@ def test_an_interrupted_training_goes_on(tmp_path, monkeypatch):
         assert torch.equal(value, resumed.state_dict()[key]), key
     assert len(files["log"].read_text().splitlines()) == 2
     assert isinstance(resumed, Compound)
+    whole = files["checkpoint"].read_bytes()
+    for content in (b"", whole[: len(whole) // 2], b"no checkpoint"):
+        files["checkpoint"].write_bytes(content)
+        with pytest.raises(InputError, match="not a checkpoint"):
+            train_compound(CAMERA, **setting, **files)
+        with pytest.raises(InputError, match="not a checkpoint"):
+            from_checkpoint(files["checkpoint"], setting["prior"])

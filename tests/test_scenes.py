@@ -5,6 +5,7 @@ import pytest
 
 import squilla
 from squilla.camera.scenes import SCENES
+from squilla.camera.solid import solid_scene
 from squilla.errors import InputError
 from squilla.files.cube import labelled
 from squilla.spectra import grid
@@ -41,3 +42,10 @@ def test_scenes_that_do_not_cover_the_band():
         squilla.load_scene("chart", grid(400, 700, 20))
     with pytest.raises(InputError, match="no file"):
         squilla.load_scene("moon", WAVELENGTH)
+
+
+@pytest.mark.parametrize("scene", [squilla.load_scene, solid_scene])
+def test_a_light_that_is_not_there_is_answered_with_those_like_it(scene):
+    given = ("chart",) if scene is squilla.load_scene else ()
+    with pytest.raises(InputError, match=r"'LED-B33' among 629; the nearest are LED-B3,"):
+        scene(*given, WAVELENGTH, 48, light="LED-B33")

@@ -7,8 +7,7 @@ capture that fails is noted and does not stop the others.
 """
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from squilla import __version__
 from squilla.batch.sinks import Folder, Sink, Stack
-from squilla.batch.workers import crew
+from squilla.batch.workers import crew, one_thread
 from squilla.errors import InputError
 from squilla.files.disk import make_folder
 from squilla.files.journal import Journal, stamp
@@ -208,25 +207,9 @@ def reconstruct_one(
 def _cube(frame: Frame, recipe: Recipe) -> "tuple[xr.Dataset, dict[str, Any]]":
     import xarray as xr
 
-    with _one_thread():
+    with one_thread():
         cube, extra, provenance = reconstruct_one(frame, recipe)
     return xr.Dataset({str(cube.name): cube, **extra}), provenance
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let one capture take one thread: sums then come out the same wherever it is worked on."""
-    import numba
-    import torch
-
-    before = torch.get_num_threads(), numba.get_num_threads()
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before[0])
-        numba.set_num_threads(before[1])
 
 
 @lru_cache(maxsize=1)

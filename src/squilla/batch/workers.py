@@ -120,6 +120,22 @@ def _processes(count: int) -> Iterator[Crew]:
         pool.shutdown(cancel_futures=True)
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let one task take one thread: sums then come out the same wherever it is worked on."""
+    import numba
+    import torch
+
+    before = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
+
+
 def _alone() -> None:
     """Make a process of this machine a worker that ends with the run, and not before."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run above is interrupted, and ends us

@@ -235,8 +235,4 @@ def poster(size: int, wavelength: np.ndarray, seed: int = 0) -> DataArray:
     texture = sum(layer / layer.std() for layer in layers)
     grey = np.clip(0.45 + 0.15 * texture, 0.05, 0.95).astype(np.float32)
     values = np.repeat(grey[..., None], len(wavelength), -1)
-    return DataArray(
-        values,
-        dims=("y", "x", "wavelength"),
-        coords={"wavelength": ("wavelength", wavelength, {"units": "nm"})},
-    )
+    return labelled(values, wavelength)

@@ -1,7 +1,9 @@
 """What each filter lets its pixels see: from the design's recipe to photoelectrons."""
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
+from torch import Tensor
 
 from squilla.camera import lens
 from squilla.camera.design import CameraDesign
@@ -13,8 +15,9 @@ from squilla.optics.filters import (
     linear_variable_filter,
     read_filters,
 )
+from squilla.optics.merit import Noise, PhotonNoise, Prior, WhiteNoise
 from squilla.optics.tables import MeasuredFilters, band_pass
-from squilla.spectra import resample
+from squilla.spectra import grid, resample
 
 
 def filters_of(design: CameraDesign) -> FilterArray | MeasuredFilters:
@@ -103,3 +106,43 @@ def seen(
     through = through.mean(1)[:, None, None]
     beside = (1 - through) * design.filters.gap * clear_response(design)
     return (through * response(design, filters, angle) + beside) * falloff[:, None, None]
+
+
+def figure_of_merit(
+    design: CameraDesign, prior: str, snr: float | None = None, exposure: float | None = None
+) -> tuple[Prior, Noise, Tensor]:
+    """Return what filters for a camera are judged by.
+
+    Parameters
+    ----------
+    design : CameraDesign
+    prior : str
+        Spectra to be seen; see `Prior.draw`.
+    snr : float, optional
+        dB, alike in every filter; default: 20.
+    exposure : float, optional
+        Instead, electrons of the mean spectrum in a pixel without a filter.
+
+    Returns
+    -------
+    prior : Prior
+        On the camera's band, in steps of 2 nm or more: neither filters nor spectra are finer.
+    noise : Noise
+    efficiency : Tensor, (K,)
+        Quantum efficiency behind the filters.
+
+    Raises
+    ------
+    InputError
+        If both an SNR and an exposure are given.
+    """
+    if snr is not None and exposure is not None:
+        raise InputError("Give --snr or --exposure, not both.")
+    band = grid(design.band.start, design.band.stop, max(design.band.step, 2.0))
+    table = design.sensor.quantum_efficiency
+    efficiency = torch.from_numpy(np.interp(band, table.wavelength, table.value))
+    if exposure is None:
+        noise = WhiteNoise(20.0 if snr is None else snr)
+    else:
+        noise = PhotonNoise(exposure, design.sensor.read_noise, efficiency)
+    return Prior.draw(prior, band), noise, efficiency

@@ -17,6 +17,7 @@ from squilla.camera.design import CameraDesign
 from squilla.camera.projection import Projection, middle
 from squilla.camera.sensor import ImageSensor
 from squilla.errors import InputError
+from squilla.files.cube import labelled
 from squilla.files.raw import Raw
 
 
@@ -163,12 +164,8 @@ class Camera(Projection):
         values = self._values(scene)
         size = self.design.field.size
         rows, columns = (middle(size, length) for length in values.shape[:2])
-        cube = DataArray(
-            values[np.ix_(rows, columns)],
-            dims=("y", "x", "wavelength"),
-            coords={"wavelength": ("wavelength", self.design.wavelength, {"units": "nm"})},
-            attrs=scene.attrs,
-        )
+        seen = values[np.ix_(rows, columns)]
+        cube = labelled(seen, self.design.wavelength, attributes=scene.attrs)
         far = self.design.array.pitch / 1000 * self.design.focal
         plane = np.full(values.shape[:2], distance) if depth is None else np.asarray(depth)
         return Truth(cube, far / plane[np.ix_(rows, columns)], self.design.centres)

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from squilla import __version__
-from squilla.cli import camera, cameras, filters, twin
+from squilla.cli import camera, cameras, filters, sweep, twin
 from squilla.cli.align import align
 from squilla.cli.calibrate import calibrate, check
 from squilla.cli.demo import demo
@@ -33,6 +33,7 @@ app.command()(align)
 app.command()(check)
 app.command()(reconstruct)
 app.command()(evaluate)
+app.add_typer(sweep.app, name="sweep")
 app.command()(view)
 app.command()(live)
 app.command()(cameras.cameras)

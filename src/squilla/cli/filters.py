@@ -8,11 +8,8 @@ import typer
 
 if TYPE_CHECKING:
     import numpy as np
-    from torch import Tensor
 
-    from squilla.camera.design import CameraDesign
     from squilla.optics.filters import FilterArray
-    from squilla.optics.merit import Noise, Prior
     from squilla.optics.tables import MeasuredFilters
 
 app = typer.Typer(
@@ -156,22 +153,22 @@ def design(
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from squilla.camera.channels import figure_of_merit
     from squilla.camera.design import CameraDesign
     from squilla.cli.checks import check_file
     from squilla.errors import InputError
     from squilla.files.disk import replacing
     from squilla.optics.design import optimise
-    from squilla.optics.filters import FabryPerotRecipe, FreeRecipe, StencilRecipe
+    from squilla.optics.filters import RECIPES
     from squilla.optics.merit import expected_error, throughput
 
-    kinds = {"stencil": StencilRecipe, "free": FreeRecipe, "fabry-perot": FabryPerotRecipe}
-    if recipe not in kinds:
-        raise InputError(f"There is no recipe {recipe!r}; there are {', '.join(kinds)}.")
+    if recipe not in RECIPES:
+        raise InputError(f"There is no recipe {recipe!r}; there are {', '.join(RECIPES)}.")
     check_file(output, (".toml",))
     if plot is not None:
         check_file(plot, (".png", ".pdf", ".svg"))
     paper = CameraDesign.load(camera)
-    known, noise, efficiency = _figure_of_merit(paper, prior, snr, exposure)
+    known, noise, efficiency = figure_of_merit(paper, prior, snr, exposure)
     band = known.wavelength
     with Progress(
         TextColumn("{task.description:8s}"), BarColumn(), MofNCompleteColumn(),
@@ -186,7 +183,7 @@ def design(
             bar.update(tasks[stage], completed=done, error=best)
 
         found = optimise(
-            kinds[recipe](filters=paper.channels),
+            RECIPES[recipe](filters=paper.channels),
             lambda response: expected_error(response * efficiency, known, noise=noise),
             band,
             draws=draws,
@@ -255,6 +252,7 @@ def tolerance(
 
     import torch
 
+    from squilla.camera.channels import figure_of_merit
     from squilla.camera.design import CameraDesign
     from squilla.errors import InputError
     from squilla.optics.filters import FilterArray
@@ -264,7 +262,7 @@ def tolerance(
     array, _ = _filters(filters)
     if not isinstance(array, FilterArray):
         raise InputError(f"{filters} is a table of responses; faults need the layers of a .toml.")
-    known, noise, efficiency = _figure_of_merit(CameraDesign.load(camera), prior, snr, exposure)
+    known, noise, efficiency = figure_of_merit(CameraDesign.load(camera), prior, snr, exposure)
     sizes = {
         "scale": scale / 100,
         "deposition": deposition / 100,
@@ -334,27 +332,3 @@ def _filters(
         drawn = {"seed": seed}
         camera = camera.model_copy(update={"filters": camera.filters.model_copy(update=drawn)})
     return filters_of(camera), camera.wavelength
-
-
-def _figure_of_merit(
-    camera: "CameraDesign", prior: str, snr: float | None, exposure: float | None
-) -> "tuple[Prior, Noise, Tensor]":
-    """Return the prior, the noise, and the camera's quantum efficiency (K,) behind the filters."""
-    import numpy as np
-    import torch
-
-    from squilla.errors import InputError
-    from squilla.optics.merit import PhotonNoise, Prior, WhiteNoise
-    from squilla.spectra import grid
-
-    if snr is not None and exposure is not None:
-        raise InputError("Give --snr or --exposure, not both.")
-    # Twice the speed of 1 nm and the same error: neither filters nor spectra are finer.
-    band = grid(camera.band.start, camera.band.stop, max(camera.band.step, 2.0))
-    table = camera.sensor.quantum_efficiency
-    efficiency = torch.from_numpy(np.interp(band, table.wavelength, table.value))
-    if exposure is None:
-        noise = WhiteNoise(20.0 if snr is None else snr)
-    else:
-        noise = PhotonNoise(exposure, camera.sensor.read_noise, efficiency)
-    return Prior.draw(prior, band), noise, efficiency

@@ -92,27 +92,12 @@ def _reconstruct_many(
 ) -> None:  # fmt: skip
     from dataclasses import asdict
 
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
     from squilla.batch.captures import reconstruct_all
+    from squilla.cli.checks import counted
 
-    columns = TextColumn("captures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), disable=as_json) as progress:
-        bar = progress.add_task("captures", total=len(frames))
+    with counted("captures", silent=as_json) as progress:
         summary = reconstruct_all(
-            frames,
-            recipe,
-            output,
-            workers=workers,
-            scheduler=scheduler,
-            progress=lambda ended, of: progress.update(bar, completed=ended, total=of),
+            frames, recipe, output, workers=workers, scheduler=scheduler, progress=progress
         )
     if as_json:
         typer.echo(json.dumps(asdict(summary)))

@@ -330,8 +330,14 @@ def _open_dataset(
     import h5py
 
     with reading(path, kind):
-        if path.is_file() and h5py.is_hdf5(path):
-            h5py.File(path, "r").close()  # says in plain words what is wrong with a damaged file
+        if path.is_file():
+            with path.open("rb") as stream:
+                classic = stream.read(3) == b"CDF"  # NetCDF 3; others are HDF5 or nothing
+            how["engine"] = "scipy" if classic else "h5netcdf"
+            if not classic:
+                h5py.File(
+                    path, "r"
+                ).close()  # says in plain words what is wrong with a damaged file
         dataset = xr.open_dataset(path, decode_times=False, cache=False, **how)
         arrays = {str(name): dataset[name] for name in dataset.variables}
         arrays = {name: each for name, each in arrays.items() if each.dtype.kind in "iufb"}

@@ -101,6 +101,8 @@ def reading(path: Path, kind: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # the readers' libraries fail on bad bytes in a dozen ways
+        if path.is_file() and path.stat().st_size == 0:
+            raise InputError(f"{path} is empty; it was never written to its end.") from error
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
             f"{path} cannot be read as {kind}; it may be cut short or of another kind ({reason})."

@@ -348,6 +348,10 @@ class FabryPerotRecipe:
         """The masks count in binary; there is nothing to exchange."""
 
 
+RECIPES = {"stencil": StencilRecipe, "free": FreeRecipe, "fabry-perot": FabryPerotRecipe}
+"""Recipes that a search can improve, by name."""
+
+
 def linear_variable_filter(
     filters: int = 36,
     band: tuple[float, float] = (500.0, 750.0),

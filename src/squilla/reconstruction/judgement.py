@@ -34,6 +34,9 @@ _FAR = 9.0
 _LACKING = 0.25
 """Share of channels without which a pixel is not to be believed."""
 
+_SATURATED = 0.125
+"""Share of saturated channels from which on that is the reason."""
+
 
 class Doubt(IntFlag):
     """Why a pixel should not be believed."""
@@ -84,7 +87,7 @@ def judge(
     exposure = float(measurement.provenance.get("exposure", 0.0)) or 1.0
     pixels = calibration.pixels
     residual = torch.full(y.shape[:2], torch.nan)
-    flags = torch.zeros(y.shape[:2], dtype=torch.uint8)
+    full = np.inf
     if pixels is not None:
         fixed = (pixels.read_noise / pixels.gain) ** 2 + 1 / 12
         residual = _residual(
@@ -92,12 +95,13 @@ def judge(
         )
         black = float(np.median(pixels.bias[::16, ::16]))
         full = 0.9 * (pixels.saturation - black) / exposure
-        saturated = (~valid & (y > full)).float().mean(-1) >= 0.125
-        flags |= saturated * Doubt.SATURATED
     # A worn unit is missed by all pixels alike; it does not speak against single ones.
     used = valid.flatten(0, 1).float().mean(0) > 0.02
-    lacking = (~valid[..., used]).float().mean(-1)
-    flags |= ((lacking >= _LACKING) & (flags == 0)) * Doubt.HIDDEN
+    flags = torch.zeros(y.shape[:2], dtype=torch.uint8)
+    _flag_lacking(
+        y.flatten(0, 1).numpy(), valid.flatten(0, 1).numpy(), used.numpy(), np.float32(full),
+        flags.view(-1).numpy(),
+    )  # fmt: skip
     flags |= (residual > _FAR) * Doubt.RESIDUAL
     if measurement.snr is not None:
         flags |= (measurement.snr < 0) * Doubt.DARK
@@ -135,21 +139,35 @@ def _residual(
     response = torch.einsum("za,amk->zkm", weight, calibration.sensitivities)
     place = angle.square() / angle.square().max().clamp_min(1e-12) * (_ZONES - 1)
     height, width, units = y.shape
-    expected = torch.empty(y.shape)
+    expected = np.empty(y.shape, np.float32)
+    spectra, zones, places = x.numpy(), response.numpy(), place.numpy()
     for top in range(0, height, _TILE):
         for left in range(0, width, _TILE):
             tile = slice(top, top + _TILE), slice(left, left + _TILE)
-            part = x[tile]
-            zone = int(place[tile].mean().round())
-            product = part.reshape(-1, part.shape[-1]) @ response[zone]
-            expected[tile] = product.view(*part.shape[:2], units)
+            zone = zones[round(float(places[tile].mean()))]
+            np.matmul(spectra[tile], zone, out=expected[tile])  # row by row: nothing is copied
     found = torch.empty(height * width)
     _mismatch(
         y.reshape(-1, units).numpy(), valid.reshape(-1, units).numpy(),
-        expected.view(-1, units).numpy(), np.float32(exposure), np.float32(shot),
+        expected.reshape(-1, units), np.float32(exposure), np.float32(shot),
         np.float32(fixed), np.float32(_MODEL**2), found.numpy(),
     )  # fmt: skip
     return found.view(height, width)
+
+
+@numba.njit(parallel=True, cache=True)
+def _flag_lacking(y, valid, used, full, flags):
+    units, wanted = y.shape[1], max(used.sum(), 1)
+    for place in numba.prange(len(y)):
+        saturated, lacking = 0, 0
+        for unit in range(units):
+            if not valid[place, unit]:
+                saturated += y[place, unit] > full
+                lacking += used[unit]
+        if saturated >= _SATURATED * units:
+            flags[place] = 1  # Doubt.SATURATED
+        elif lacking >= _LACKING * wanted:
+            flags[place] = 2  # Doubt.HIDDEN
 
 
 @numba.njit(parallel=True, cache=True)

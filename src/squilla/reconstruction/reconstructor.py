@@ -278,7 +278,7 @@ class Reconstructor(nn.Module):
         self, cube: np.ndarray, measurement: Measurement, scale: Scale = "consistent"
     ) -> "DataArray":
         """Return spectra with their wavelengths, unit and origin."""
-        from xarray import DataArray
+        from squilla.files.cube import labelled
 
         origin = {
             "long_name": "photon radiance",
@@ -290,18 +290,8 @@ class Reconstructor(nn.Module):
         }
         origin |= {f"model_{key}": value for key, value in self.provenance.items()}
         origin |= {f"measurement_{key}": value for key, value in measurement.provenance.items()}
-        band = {
-            "standard_name": "radiation_wavelength",
-            "long_name": "wavelength",
-            "units": "nm",
-        }
-        return DataArray(
-            cube,
-            dims=("y", "x", "wavelength"),
-            coords={"wavelength": ("wavelength", np.asarray(self.wavelength), band)},
-            name="radiance",
-            attrs={key: value for key, value in origin.items() if value is not None},
-        )
+        known = {key: value for key, value in origin.items() if value is not None}
+        return labelled(cube, self.wavelength, attributes=known)
 
     def save(self, path: str | Path, *, half: bool = False) -> None:
         """Write the weights to a safetensors file that `load_model` reads.

@@ -28,7 +28,7 @@ from squilla.reconstruction.evidence import (
 from squilla.reconstruction.prior import Prior, fit_prior
 from squilla.spectra import grid
 from squilla.training.cameras import random_response
-from squilla.training.fit import shown
+from squilla.training.fit import read_checkpoint, shown
 from squilla.training.scenes import Palette, Scenes, draw_scenes
 
 SIZE = 64
@@ -226,6 +226,10 @@ def losses(
     return apart.square().mean((1, 2)), score, cover
 
 
+_PARTS = ("recipe", "step", "history", "back", "averaged", "optimiser")
+"""Of a checkpoint."""
+
+
 class _Run:
     """The state of a training."""
 
@@ -306,7 +310,7 @@ class _Run:
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of the same training."""
-        state = torch.load(path, map_location=self.device, weights_only=True)
+        state = read_checkpoint(path, _PARTS)
         if state["recipe"] != vars(self.recipe):
             raise InputError(
                 f"{path} is the checkpoint of another training; remove it or name another file."
@@ -328,7 +332,7 @@ class _Run:
 
 def from_checkpoint(path: Path, prior: Prior) -> Compound:
     """Return the model that a training has come to, with the averaged weights."""
-    state = torch.load(path, map_location="cpu", weights_only=True)
+    state = read_checkpoint(path, _PARTS)
     flat = Calibration.from_sensitivity(np.ones((1, len(prior.wavelength))), prior.wavelength)
     model = Compound(flat, prior).eval()
     model.back.load_state_dict(state["averaged"])

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from inspect import signature
@@ -307,13 +307,8 @@ class _Run:
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of the same training."""
-        try:
-            # weights_only: nothing in the file is executed.
-            state = torch.load(path, map_location="cpu", weights_only=True)
-            identity = state["identity"]
-        except Exception as error:  # torch raises whatever its reader stumbles over
-            raise InputError(f"{path} is not a checkpoint of a training; remove it.") from error
-        own = self._identity()
+        state = read_checkpoint(path, ("identity", "history", "model", "optimiser"))
+        identity, own = state["identity"], self._identity()
         if identity != own:
             other = sorted(key for key in own if identity.get(key) != own[key])
             raise InputError(
@@ -367,6 +362,16 @@ def _products(precision: Precision) -> Iterator[None]:
             yield
     finally:
         torch.set_float32_matmul_precision(before)
+
+
+def read_checkpoint(path: Path, parts: Sequence[str]) -> dict[str, Any]:
+    """Read the parts of a checkpoint onto the CPU; InputError if it is damaged or none at all."""
+    try:
+        # weights_only: nothing in the file is executed.
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        return {part: state[part] for part in parts}
+    except Exception as error:  # torch raises whatever its reader stumbles over
+        raise InputError(f"{path} is not a checkpoint of a training; remove it.") from error
 
 
 def shown(
