@@ -60,22 +60,20 @@ class Aligned:
 
     values : (M, 2 P) in units of the noise; along x, then along y.
     halves : two of (M, M), inner products of the units over each half of the field, not scaled.
+    products : (M, M), inner products of `values`.
     share : (M, R), orthonormal: values are about share @ common.
     common : (R, 2 P) pictures.
     slopes : (R, 2, 2 P) of the pictures along y and x, 1/px.
-    moved : (M, 2 K), products of values with how the first picture changes when it moves.
-    moves : (2 K, 2 K), products of those changes.
     shape : (h, w) of a picture.
     shared : number of points that share their noise.
     """
 
     values: np.ndarray
     halves: list[np.ndarray]
+    products: np.ndarray
     share: np.ndarray
     common: np.ndarray
     slopes: np.ndarray
-    moved: np.ndarray
-    moves: np.ndarray
     shape: tuple[int, int]
     shared: float
 
@@ -134,14 +132,13 @@ def find_plane(
     -------
     Placement
     """
-    # Were single units free, several pictures would take for colour what is still misplaced.
-    stages = [(edges, 1 if free else _RANK)]
+    stages = [(edges, _RANK)]
     if start is None:
         coarse = edges.directions()
         plane = np.array([_search(coarse, lattice, first, span), 0.0, 0.0])
-        stages = [(coarse, 1), (edges.thinned(), 1), *stages]
+        stages = [(coarse, 1), *stages]
     else:
-        plane, stages = np.array(start, float), [(edges, 1), *stages]
+        plane = np.array(start, float)
     offset = np.zeros(first.shape)
     for level, rank in stages:
         for _ in range(8):
@@ -211,23 +208,28 @@ def compare(
     values = values.reshape(units, 2 * points)
     _fill_in(values, seen.reshape(units, points))
     halves = _products(values)
-    share, spread = _mixtures(halves[0] + halves[1], 2 * points, rank)
-    rank = share.shape[1]
+    first, spread = _brightest(halves[0] + halves[1], 2 * points)
     values /= spread[:, None].astype(np.float32)
-    common = share.T.astype(np.float32) @ values
+    common = first.T.astype(np.float32) @ values
     slopes = _slopes(common, shape) / edges.step
     moves = _moves(slopes, grid[:terms])
     moved, gram = values @ moves.T, (moves @ moves.T).astype(float)
+    products = (halves[0] + halves[1]) / np.outer(spread, spread)
+    share = _colours(first, products, moved, gram, 2 * points, rank)
+    if share.shape[1] > 1:
+        more = share[:, 1:].T.astype(np.float32) @ values
+        common, more = np.concatenate([common, more]), _slopes(more, shape) / edges.step
+        slopes, more = np.concatenate([slopes, more]), _moves(more, grid[:terms])
+        moved = np.hstack([moved, values @ more.T])
+        moves = np.concatenate([moves, more])
+        gram = (moves @ moves.T).astype(float)
+    rank = share.shape[1]
     misfit = moved - share @ (common @ moves.T)
     pull = -np.einsum("mr,mra->ma", share, misfit.reshape(units, rank, -1))
     free = np.eye(units) - share @ share.T
     half = np.einsum("ir,rasb->iasb", share, gram.reshape(rank, 2 * terms, rank, 2 * terms))
     precision = np.einsum("ij,iasb,js->iajb", free, half, share, optimize=True)
-    first_alone = slice(2 * terms)
-    aligned = Aligned(
-        values, halves, share, common, slopes, moved[:, first_alone],
-        gram[first_alone, first_alone], shape, edges.shared,
-    )  # fmt: skip
+    aligned = Aligned(values, halves, products, share, common, slopes, shape, edges.shared)
     return Evidence(pull / edges.shared, precision / edges.shared, aligned)
 
 
@@ -252,8 +254,8 @@ def _products(values: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def _mixtures(products: np.ndarray, count: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return how units mix the few pictures that explain most.
+def _brightest(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return how units show the one picture that explains most, and their noise.
 
     Parameters
     ----------
@@ -261,40 +263,51 @@ def _mixtures(products: np.ndarray, count: int, rank: int) -> tuple[np.ndarray, 
         Inner products of the units' values.
     count : int
         Number of values of each unit.
-    rank : int
-        Most pictures that the units' edges are taken to be mixed from.
 
     Returns
     -------
-    share : array, (M, rank), orthonormal: values / spread is about share @ pictures.
+    share : array, (M, 1), of length one: values / spread is about share @ picture.
     spread : array, (M,), standard deviation of each unit's noise.
     """
     strength, vectors = np.linalg.eigh(products)
     alone = np.diag(products) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
     spread = np.sqrt(np.maximum(alone / count, 1e-5))
-    strength, vectors = np.linalg.eigh(products / np.outer(spread, spread))
-    clear = int(np.sum(strength > _FAINT * count))
-    rank = max(1, min(rank, len(products) // 6, clear))
-    return vectors[:, : -1 - rank : -1], spread
+    return np.linalg.eigh(products / np.outer(spread, spread))[1][:, -1:], spread
 
 
-def _unmoved(aligned: Aligned, products: np.ndarray) -> np.ndarray:
+def _colours(first, products, moved, moves, count: int, rank: int) -> np.ndarray:
     """Return the shares in the first picture and in others that no shift has made, (M, R).
 
     A unit that lies off shows the first picture and some of its slopes, as if that were another
-    colour. Where it is asked whether single units lie off, whatever those slopes explain must
-    therefore tell nothing of the other pictures.
+    colour. Whatever those slopes explain must therefore tell nothing of the other pictures, or
+    these would explain what is still misplaced, and it would stay so.
+
+    Parameters
+    ----------
+    first : array, (M, 1)
+    products : array, (M, M)
+        Inner products of the units' values, in units of the noise.
+    moved : array, (M, 2 K)
+        Products of the values with how the first picture changes when it moves.
+    moves : array, (2 K, 2 K)
+        Products of those changes.
+    count : int
+        Number of values of each unit.
+    rank : int
+        Most pictures.
     """
-    first, moves = aligned.share[:, :1], aligned.moves
+    most = min(rank, len(first) // 6)
+    if most < 2:
+        return first
     moves = moves + 1e-6 * np.trace(moves) / len(moves) * np.eye(len(moves))
     rest = np.eye(len(first)) - first @ first.T
-    shifts = rest @ aligned.moved @ np.linalg.solve(moves, aligned.moved.T) @ rest
+    moved = rest @ moved
+    shifts = moved @ np.linalg.solve(moves, moved.T)
     strength, vectors = np.linalg.eigh(rest @ products @ rest - shifts)
     # Slopes are differences, and do not explain all that a shift has made.
-    least = max(_FAINT * aligned.values.shape[1], 0.1 * np.linalg.eigvalsh(shifts)[-1])
+    least = max(_FAINT * count, 0.1 * np.linalg.eigvalsh(shifts)[-1])
     clear = int(np.sum(strength > least))
-    more = max(0, min(_RANK, len(first) // 6, clear + 1) - 1)
-    return np.hstack([first, vectors[:, ::-1][:, :more]])
+    return np.hstack([first, vectors[:, ::-1][:, : min(clear, most - 1)]])
 
 
 def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
@@ -306,8 +319,7 @@ def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
     uncertainty : array, (4, M, 2), px
         Standard deviation by the noise.
     """
-    products = (aligned.values @ aligned.values.T).astype(float)
-    share, first = _unmoved(aligned, products), aligned.share[:, 0]
+    share, first, products = aligned.share, aligned.share[:, 0], aligned.products
     values = aligned.values.reshape(-1, 2, *aligned.shape)
     slopes = aligned.slopes[0].reshape(2, 2, *aligned.shape)
     rows, columns = ((slice(0, size // 2), slice(size // 2, size)) for size in aligned.shape)
