@@ -27,8 +27,14 @@ Through other filters other parts of a colourful scene show. Were they all taken
 such differences would look like shifts.
 """
 
-_FAINT = 1.3
+_FAINT = 1.15
 """Variance in units of the noise's from which on a picture is taken to be one of the mixture."""
+
+_ALIKE = 30.0
+"""How much more alike the edges of two pictures are than chance, in power.
+
+The edges of other colours lie where those of the first picture do, and look like its shifts.
+"""
 
 _NEAR = 0.02
 """Last change of a shift from which on Gauss-Newton steps end, px; they converge quadratically."""
@@ -61,8 +67,8 @@ class Aligned:
     values : (M, 2 P) in units of the noise; along x, then along y.
     halves : two of (M, M), inner products of the units over each half of the field, not scaled.
     products : (M, M), inner products of `values`.
-    share : (M, R), orthonormal: values are about share @ common.
-    common : (R, 2 P) pictures.
+    share : (M, R), orthonormal: values are about share @ pictures.
+    rest : (M, M), inverse covariance of the units' values about the first picture.
     slopes : (R, 2, 2 P) of the pictures along y and x, 1/px.
     shape : (h, w) of a picture.
     shared : number of points that share their noise.
@@ -72,7 +78,7 @@ class Aligned:
     halves: list[np.ndarray]
     products: np.ndarray
     share: np.ndarray
-    common: np.ndarray
+    rest: np.ndarray
     slopes: np.ndarray
     shape: tuple[int, int]
     shared: float
@@ -215,21 +221,20 @@ def compare(
     moves = _moves(slopes, grid[:terms])
     moved, gram = values @ moves.T, (moves @ moves.T).astype(float)
     products = (halves[0] + halves[1]) / np.outer(spread, spread)
-    share = _colours(first, products, moved, gram, 2 * points, rank)
+    share, rest = _colours(first, products, moved, gram, 2 * points, rank)
     if share.shape[1] > 1:
         more = share[:, 1:].T.astype(np.float32) @ values
-        common, more = np.concatenate([common, more]), _slopes(more, shape) / edges.step
+        more = _slopes(more, shape) / edges.step
         slopes, more = np.concatenate([slopes, more]), _moves(more, grid[:terms])
         moved = np.hstack([moved, values @ more.T])
         moves = np.concatenate([moves, more])
         gram = (moves @ moves.T).astype(float)
     rank = share.shape[1]
-    misfit = moved - share @ (common @ moves.T)
-    pull = -np.einsum("mr,mra->ma", share, misfit.reshape(units, rank, -1))
-    free = np.eye(units) - share @ share.T
+    misfit = (rest @ moved).reshape(units, rank, -1)
+    pull = -np.einsum("mr,mra->ma", share, misfit)
     half = np.einsum("ir,rasb->iasb", share, gram.reshape(rank, 2 * terms, rank, 2 * terms))
-    precision = np.einsum("ij,iasb,js->iajb", free, half, share, optimize=True)
-    aligned = Aligned(values, halves, products, share, common, slopes, shape, edges.shared)
+    precision = np.einsum("ij,iasb,js->iajb", rest, half, share, optimize=True)
+    aligned = Aligned(values, halves, products, share, rest, slopes, shape, edges.shared)
     return Evidence(pull / edges.shared, precision / edges.shared, aligned)
 
 
@@ -275,8 +280,15 @@ def _brightest(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
     return np.linalg.eigh(products / np.outer(spread, spread))[1][:, -1:], spread
 
 
-def _colours(first, products, moved, moves, count: int, rank: int) -> np.ndarray:
-    """Return the shares in the first picture and in others that no shift has made, (M, R).
+def _colours(
+    first: np.ndarray,
+    products: np.ndarray,
+    moved: np.ndarray,
+    moves: np.ndarray,
+    count: int,
+    rank: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return how units mix the first picture and others that no shift has made.
 
     A unit that lies off shows the first picture and some of its slopes, as if that were another
     colour. Whatever those slopes explain must therefore tell nothing of the other pictures, or
@@ -295,19 +307,28 @@ def _colours(first, products, moved, moves, count: int, rank: int) -> np.ndarray
         Number of values of each unit.
     rank : int
         Most pictures.
+
+    Returns
+    -------
+    share : array, (M, R), orthonormal
+    rest : array, (M, M)
+        Inverse covariance of what the units see beside the first picture, of which nothing is
+        known beforehand: noise of variance one, and the other pictures as strong as they are.
     """
+    rest = np.eye(len(first)) - first @ first.T
     most = min(rank, len(first) // 6)
     if most < 2:
-        return first
+        return first, rest
     moves = moves + 1e-6 * np.trace(moves) / len(moves) * np.eye(len(moves))
-    rest = np.eye(len(first)) - first @ first.T
     moved = rest @ moved
     shifts = moved @ np.linalg.solve(moves, moved.T)
     strength, vectors = np.linalg.eigh(rest @ products @ rest - shifts)
     # Slopes are differences, and do not explain all that a shift has made.
     least = max(_FAINT * count, 0.1 * np.linalg.eigvalsh(shifts)[-1])
-    clear = int(np.sum(strength > least))
-    return np.hstack([first, vectors[:, ::-1][:, : min(clear, most - 1)]])
+    some = np.flatnonzero(strength > least)[::-1][: most - 1]
+    others = vectors[:, some]
+    weight = 1 - 1 / (1 + _ALIKE * (strength[some] / count - 1))
+    return np.hstack([first, others]), rest - others * weight @ others.T
 
 
 def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
@@ -319,18 +340,17 @@ def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
     uncertainty : array, (4, M, 2), px
         Standard deviation by the noise.
     """
-    share, first, products = aligned.share, aligned.share[:, 0], aligned.products
+    first, rest, products = aligned.share[:, 0], aligned.rest, aligned.products
     values = aligned.values.reshape(-1, 2, *aligned.shape)
     slopes = aligned.slopes[0].reshape(2, 2, *aligned.shape)
     rows, columns = ((slice(0, size // 2), slice(size // 2, size)) for size in aligned.shape)
-    free = np.eye(len(first)) - share @ share.T
-    left = np.diag(free @ products @ free) / np.diag(free) / aligned.values.shape[1]
+    left = np.diag(rest @ products @ rest) / np.diag(rest) / aligned.values.shape[1]
     scale = 1 / (aligned.shared * np.maximum(left, 1e-6))[:, None]  # other colours are no noise
     shifts, doubts = [], []
     for quarter in [(..., row, column) for row in rows for column in columns]:
         rise = slopes[quarter].reshape(2, -1)
-        pull = -first[:, None] * (free @ (values[quarter].reshape(len(first), -1) @ rise.T))
-        precision = (first**2 * np.diag(free))[:, None, None] * (rise @ rise.T)
+        pull = -first[:, None] * (rest @ (values[quarter].reshape(len(first), -1) @ rise.T))
+        precision = (first**2 * np.diag(rest))[:, None, None] * (rise @ rise.T)
         covariance = np.linalg.inv(precision * scale[..., None] + 1e-3 * np.eye(2))
         shifts.append(np.einsum("mab,mb->ma", covariance, pull * scale))
         doubts.append(np.sqrt(np.einsum("maa->ma", covariance)))
@@ -362,11 +382,10 @@ def _relief(aligned: Aligned, baseline: np.ndarray) -> np.ndarray:
     rank, points = share.shape[1], shape[0] * shape[1]
     along = (baseline.T[None] * share.T[:, None]).reshape(2 * rank, -1)  # (rank axis, M)
     slopes = aligned.slopes.reshape(2 * rank, -1)
-    misfit = along.astype(np.float32) @ aligned.values
-    misfit -= (along @ share).astype(np.float32) @ aligned.common
-    free = np.eye(len(share)) - share @ share.T
+    along_rest = along @ aligned.rest
+    misfit = along_rest.astype(np.float32) @ aligned.values
     pull = -(misfit * slopes).sum(0)
-    precision = ((along @ free @ along.T).astype(np.float32) @ slopes * slopes).sum(0)
+    precision = ((along_rest @ along.T).astype(np.float32) @ slopes * slopes).sum(0)
     rows, columns = (np.arange(size) * _PARTS // size for size in shape)
     part = (rows[:, None] * _PARTS + columns).ravel()
     sums = [
