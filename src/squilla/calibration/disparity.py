@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import torch
 
 from squilla.calibration.calibration import Lattice
 from squilla.calibration.edges import Edges
@@ -38,6 +39,9 @@ The edges of other colours lie where those of the first picture do, and look lik
 
 _NEAR = 0.02
 """Last change of a shift from which on Gauss-Newton steps end, px; they converge quadratically."""
+
+_ROUGHLY = 0.2
+"""The same where the steps go on with finer edges, px."""
 
 _PARTS = 5
 """Rows and columns of parts of the field in which it is seen whether the scene is a plane."""
@@ -138,22 +142,22 @@ def find_plane(
     -------
     Placement
     """
-    stages = [(edges, _RANK)]
+    stages = [(edges, _RANK, _NEAR)]
     if start is None:
         coarse = edges.directions()
         plane = np.array([_search(coarse, lattice, first, span), 0.0, 0.0])
-        stages = [(coarse, 1), *stages]
+        stages = [(coarse, 1, _ROUGHLY), *stages]
     else:
         plane = np.array(start, float)
     offset = np.zeros(first.shape)
-    for level, rank in stages:
+    for level, rank, near in stages:
         for _ in range(8):
             guess = plane_map(plane, lattice, level.step)
             found = compare(level, lattice, first + offset, guess, 3, rank)
             step, moved, covariance = _solve(found, lattice, plane, offset, free)
             plane, offset = plane + step, offset + moved
             change = max(np.abs(step).max() * _reach(lattice), np.abs(moved).max())
-            if change < _NEAR:
+            if change < near:
                 break
     pull, precision = _relief(found.aligned, lattice.baseline)
     return Placement(
@@ -216,19 +220,17 @@ def compare(
     halves = _products(values)
     first, spread = _brightest(halves[0] + halves[1], 2 * points)
     values /= spread[:, None].astype(np.float32)
-    common = first.T.astype(np.float32) @ values
-    slopes = _slopes(common, shape) / edges.step
+    slopes = _slopes(_product(first.T, values.T), shape) / np.float32(edges.step)
     moves = _moves(slopes, grid[:terms])
-    moved, gram = values @ moves.T, (moves @ moves.T).astype(float)
+    moved, gram = _product(values, moves), _product(moves, moves).astype(float)
     products = (halves[0] + halves[1]) / np.outer(spread, spread)
     share, rest = _colours(first, products, moved, gram, 2 * points, rank)
     if share.shape[1] > 1:
-        more = share[:, 1:].T.astype(np.float32) @ values
-        more = _slopes(more, shape) / edges.step
+        more = _slopes(_product(share[:, 1:].T, values.T), shape) / np.float32(edges.step)
         slopes, more = np.concatenate([slopes, more]), _moves(more, grid[:terms])
-        moved = np.hstack([moved, values @ more.T])
+        moved = np.hstack([moved, _product(values, more)])
         moves = np.concatenate([moves, more])
-        gram = (moves @ moves.T).astype(float)
+        gram = _product(moves, moves).astype(float)
     rank = share.shape[1]
     misfit = (rest @ moved).reshape(units, rank, -1)
     pull = -np.einsum("mr,mra->ma", share, misfit)
@@ -254,9 +256,21 @@ def _products(values: np.ndarray) -> list[np.ndarray]:
     parts = values.reshape(len(values), 2, -1)
     middle = parts.shape[2] // 2
     return [
-        (half[:, 0] @ half[:, 0].T + half[:, 1] @ half[:, 1].T).astype(float)
+        sum(_product(half[:, c], half[:, c]).astype(float) for c in (0, 1))
         for half in (parts[..., :middle], parts[..., middle:])
     ]
+
+
+def _product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return one @ other.T, float32, by PyTorch, whose threads do not get in the way of Numba's."""
+    pair = [torch.from_numpy(np.asarray(each, np.float32)) for each in (one, other)]
+    return (pair[0] @ pair[1].T).numpy()
+
+
+def _eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return eigenvalues, rising, and eigenvectors of a symmetric matrix."""
+    values, vectors = torch.linalg.eigh(torch.from_numpy(matrix))
+    return values.numpy(), vectors.numpy()
 
 
 def _brightest(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -274,10 +288,10 @@ def _brightest(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
     share : array, (M, 1), of length one: values / spread is about share @ picture.
     spread : array, (M,), standard deviation of each unit's noise.
     """
-    strength, vectors = np.linalg.eigh(products)
+    strength, vectors = _eigen(products)
     alone = np.diag(products) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
     spread = np.sqrt(np.maximum(alone / count, 1e-5))
-    return np.linalg.eigh(products / np.outer(spread, spread))[1][:, -1:], spread
+    return _eigen(products / np.outer(spread, spread))[1][:, -1:], spread
 
 
 def _colours(
@@ -322,9 +336,9 @@ def _colours(
     moves = moves + 1e-6 * np.trace(moves) / len(moves) * np.eye(len(moves))
     moved = rest @ moved
     shifts = moved @ np.linalg.solve(moves, moved.T)
-    strength, vectors = np.linalg.eigh(rest @ products @ rest - shifts)
+    strength, vectors = _eigen(rest @ products @ rest - shifts)
     # Slopes are differences, and do not explain all that a shift has made.
-    least = max(_FAINT * count, 0.1 * np.linalg.eigvalsh(shifts)[-1])
+    least = max(_FAINT * count, 0.1 * _eigen(shifts)[0][-1])
     some = np.flatnonzero(strength > least)[::-1][: most - 1]
     others = vectors[:, some]
     weight = 1 - 1 / (1 + _ALIKE * (strength[some] / count - 1))
@@ -349,7 +363,7 @@ def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
     shifts, doubts = [], []
     for quarter in [(..., row, column) for row in rows for column in columns]:
         rise = slopes[quarter].reshape(2, -1)
-        pull = -first[:, None] * (rest @ (values[quarter].reshape(len(first), -1) @ rise.T))
+        pull = -first[:, None] * (rest @ _product(values[quarter].reshape(len(first), -1), rise))
         precision = (first**2 * np.diag(rest))[:, None, None] * (rise @ rise.T)
         covariance = np.linalg.inv(precision * scale[..., None] + 1e-3 * np.eye(2))
         shifts.append(np.einsum("mab,mb->ma", covariance, pull * scale))
@@ -369,7 +383,7 @@ def _agreement(one: np.ndarray, other: np.ndarray) -> float:
     How the units are weighted is learnt from the other half: what they have in common by chance
     then does not count. `one` and `other` hold the units' inner products there, (M, M).
     """
-    share = np.linalg.eigh(one)[1][:, -1]
+    share = _eigen(one)[1][:, -1]
     energy, shared = np.diag(other), other @ share
     rest = share @ shared - 2 * share * shared + share**2 * energy  # of the others' picture
     alike = (shared - share * energy) / np.sqrt(np.maximum(rest * energy, 1e-12))
@@ -383,7 +397,7 @@ def _relief(aligned: Aligned, baseline: np.ndarray) -> np.ndarray:
     along = (baseline.T[None] * share.T[:, None]).reshape(2 * rank, -1)  # (rank axis, M)
     slopes = aligned.slopes.reshape(2 * rank, -1)
     along_rest = along @ aligned.rest
-    misfit = along_rest.astype(np.float32) @ aligned.values
+    misfit = _product(along_rest, aligned.values.T)
     pull = -(misfit * slopes).sum(0)
     precision = ((along_rest @ along.T).astype(np.float32) @ slopes * slopes).sum(0)
     rows, columns = (np.arange(size) * _PARTS // size for size in shape)
@@ -452,8 +466,6 @@ def _solve(evidence: Evidence, lattice: Lattice, plane, offset, free: float):
 
 def _search(edges: Edges, lattice: Lattice, first: np.ndarray, span: tuple[float, float]) -> float:
     """Return the disparity at which all pairs of units together agree best, px per pitch."""
-    import torch
-
     reach = _reach(lattice)
     room = int(np.ceil(max(map(abs, span)) * reach / edges.step))  # or what leaves comes back
     taper = _taper(edges.values.shape[2])[:, None] * _taper(edges.values.shape[3])
@@ -477,8 +489,6 @@ def _search(edges: Edges, lattice: Lattice, first: np.ndarray, span: tuple[float
 
 def _low(size: int):
     """Return the indices of the frequencies below a quarter of the sampling rate."""
-    import torch
-
     return torch.cat([torch.arange(size // 4), torch.arange(size - size // 4, size)])
 
 
