@@ -35,9 +35,6 @@ _TAPS = SINC.shape[0]
 _DRIFT = 0.5
 """What a live scene's disparity may change by from frame to frame, px per pitch."""
 
-_LOOSE = 0.5
-"""How far units may have moved since the calibration, px (standard deviation)."""
-
 _CLEAR = 0.5
 """Mean correlation of the sub-images' edges above which shifts of single units are believed."""
 
@@ -330,7 +327,8 @@ def place(
     found = find_plane(edges, lattice, first, span, start=start)
     moved = drift(found, lattice)
     if refine or (refine is None and moved > STALE and found.score > _CLEAR):
-        found = find_plane(edges, lattice, first, span, start=found.plane, free=_LOOSE)
+        free = max(moved, STALE)
+        found = find_plane(edges, lattice, first, span, start=found.plane, free=free)
         moved = drift(found, lattice)
     quality = {"alignment": "from the scene", "alignment_score": found.score}
     quality["misalignment"] = misalignment(found, lattice)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import torch
 
 from squilla.calibration.calibration import Lattice
 from squilla.calibration.edges import Edges
@@ -27,11 +28,20 @@ Through other filters other parts of a colourful scene show. Were they all taken
 such differences would look like shifts.
 """
 
-_FAINT = 1.3
+_FAINT = 1.15
 """Variance in units of the noise's from which on a picture is taken to be one of the mixture."""
+
+_ALIKE = 30.0
+"""How much more alike the edges of two pictures are than chance, in power.
+
+The edges of other colours lie where those of the first picture do, and look like its shifts.
+"""
 
 _NEAR = 0.02
 """Last change of a shift from which on Gauss-Newton steps end, px; they converge quadratically."""
+
+_ROUGHLY = 0.2
+"""The same where the steps go on with finer edges, px."""
 
 _PARTS = 5
 """Rows and columns of parts of the field in which it is seen whether the scene is a plane."""
@@ -60,22 +70,20 @@ class Aligned:
 
     values : (M, 2 P) in units of the noise; along x, then along y.
     halves : two of (M, M), inner products of the units over each half of the field, not scaled.
-    share : (M, R), orthonormal: values are about share @ common.
-    common : (R, 2 P) pictures.
+    products : (M, M), inner products of `values`.
+    share : (M, R), orthonormal: values are about share @ pictures.
+    rest : (M, M), inverse covariance of the units' values about the first picture.
     slopes : (R, 2, 2 P) of the pictures along y and x, 1/px.
-    moved : (M, 2 K), products of values with how the first picture changes when it moves.
-    moves : (2 K, 2 K), products of those changes.
     shape : (h, w) of a picture.
     shared : number of points that share their noise.
     """
 
     values: np.ndarray
     halves: list[np.ndarray]
+    products: np.ndarray
     share: np.ndarray
-    common: np.ndarray
+    rest: np.ndarray
     slopes: np.ndarray
-    moved: np.ndarray
-    moves: np.ndarray
     shape: tuple[int, int]
     shared: float
 
@@ -134,23 +142,22 @@ def find_plane(
     -------
     Placement
     """
-    # Were single units free, several pictures would take for colour what is still misplaced.
-    stages = [(edges, 1 if free else _RANK)]
+    stages = [(edges, _RANK, _NEAR)]
     if start is None:
         coarse = edges.directions()
         plane = np.array([_search(coarse, lattice, first, span), 0.0, 0.0])
-        stages = [(coarse, 1), (edges.thinned(), 1), *stages]
+        stages = [(coarse, 1, _ROUGHLY), *stages]
     else:
-        plane, stages = np.array(start, float), [(edges, 1), *stages]
+        plane = np.array(start, float)
     offset = np.zeros(first.shape)
-    for level, rank in stages:
+    for level, rank, near in stages:
         for _ in range(8):
             guess = plane_map(plane, lattice, level.step)
             found = compare(level, lattice, first + offset, guess, 3, rank)
             step, moved, covariance = _solve(found, lattice, plane, offset, free)
             plane, offset = plane + step, offset + moved
             change = max(np.abs(step).max() * _reach(lattice), np.abs(moved).max())
-            if change < _NEAR:
+            if change < near:
                 break
     pull, precision = _relief(found.aligned, lattice.baseline)
     return Placement(
@@ -211,23 +218,25 @@ def compare(
     values = values.reshape(units, 2 * points)
     _fill_in(values, seen.reshape(units, points))
     halves = _products(values)
-    share, spread = _mixtures(halves[0] + halves[1], 2 * points, rank)
-    rank = share.shape[1]
+    first, spread = _brightest(halves[0] + halves[1], 2 * points)
     values /= spread[:, None].astype(np.float32)
-    common = share.T.astype(np.float32) @ values
-    slopes = _slopes(common, shape) / edges.step
+    slopes = _slopes(_product(first.T, values.T), shape) / np.float32(edges.step)
     moves = _moves(slopes, grid[:terms])
-    moved, gram = values @ moves.T, (moves @ moves.T).astype(float)
-    misfit = moved - share @ (common @ moves.T)
-    pull = -np.einsum("mr,mra->ma", share, misfit.reshape(units, rank, -1))
-    free = np.eye(units) - share @ share.T
+    moved, gram = _product(values, moves), _product(moves, moves).astype(float)
+    products = (halves[0] + halves[1]) / np.outer(spread, spread)
+    share, rest = _colours(first, products, moved, gram, 2 * points, rank)
+    if share.shape[1] > 1:
+        more = _slopes(_product(share[:, 1:].T, values.T), shape) / np.float32(edges.step)
+        slopes, more = np.concatenate([slopes, more]), _moves(more, grid[:terms])
+        moved = np.hstack([moved, _product(values, more)])
+        moves = np.concatenate([moves, more])
+        gram = _product(moves, moves).astype(float)
+    rank = share.shape[1]
+    misfit = (rest @ moved).reshape(units, rank, -1)
+    pull = -np.einsum("mr,mra->ma", share, misfit)
     half = np.einsum("ir,rasb->iasb", share, gram.reshape(rank, 2 * terms, rank, 2 * terms))
-    precision = np.einsum("ij,iasb,js->iajb", free, half, share, optimize=True)
-    first_alone = slice(2 * terms)
-    aligned = Aligned(
-        values, halves, share, common, slopes, moved[:, first_alone],
-        gram[first_alone, first_alone], shape, edges.shared,
-    )  # fmt: skip
+    precision = np.einsum("ij,iasb,js->iajb", rest, half, share, optimize=True)
+    aligned = Aligned(values, halves, products, share, rest, slopes, shape, edges.shared)
     return Evidence(pull / edges.shared, precision / edges.shared, aligned)
 
 
@@ -247,13 +256,25 @@ def _products(values: np.ndarray) -> list[np.ndarray]:
     parts = values.reshape(len(values), 2, -1)
     middle = parts.shape[2] // 2
     return [
-        (half[:, 0] @ half[:, 0].T + half[:, 1] @ half[:, 1].T).astype(float)
+        sum(_product(half[:, c], half[:, c]).astype(float) for c in (0, 1))
         for half in (parts[..., :middle], parts[..., middle:])
     ]
 
 
-def _mixtures(products: np.ndarray, count: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return how units mix the few pictures that explain most.
+def _product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return one @ other.T, float32, by PyTorch, whose threads do not get in the way of Numba's."""
+    pair = [torch.from_numpy(np.asarray(each, np.float32)) for each in (one, other)]
+    return (pair[0] @ pair[1].T).numpy()
+
+
+def _eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return eigenvalues, rising, and eigenvectors of a symmetric matrix."""
+    values, vectors = torch.linalg.eigh(torch.from_numpy(matrix))
+    return values.numpy(), vectors.numpy()
+
+
+def _brightest(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return how units show the one picture that explains most, and their noise.
 
     Parameters
     ----------
@@ -261,40 +282,67 @@ def _mixtures(products: np.ndarray, count: int, rank: int) -> tuple[np.ndarray, 
         Inner products of the units' values.
     count : int
         Number of values of each unit.
-    rank : int
-        Most pictures that the units' edges are taken to be mixed from.
 
     Returns
     -------
-    share : array, (M, rank), orthonormal: values / spread is about share @ pictures.
+    share : array, (M, 1), of length one: values / spread is about share @ picture.
     spread : array, (M,), standard deviation of each unit's noise.
     """
-    strength, vectors = np.linalg.eigh(products)
+    strength, vectors = _eigen(products)
     alone = np.diag(products) - strength[-1] * vectors[:, -1] ** 2  # what is left of each unit
     spread = np.sqrt(np.maximum(alone / count, 1e-5))
-    strength, vectors = np.linalg.eigh(products / np.outer(spread, spread))
-    clear = int(np.sum(strength > _FAINT * count))
-    rank = max(1, min(rank, len(products) // 6, clear))
-    return vectors[:, : -1 - rank : -1], spread
+    return _eigen(products / np.outer(spread, spread))[1][:, -1:], spread
 
 
-def _unmoved(aligned: Aligned, products: np.ndarray) -> np.ndarray:
-    """Return the shares in the first picture and in others that no shift has made, (M, R).
+def _colours(
+    first: np.ndarray,
+    products: np.ndarray,
+    moved: np.ndarray,
+    moves: np.ndarray,
+    count: int,
+    rank: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return how units mix the first picture and others that no shift has made.
 
     A unit that lies off shows the first picture and some of its slopes, as if that were another
-    colour. Where it is asked whether single units lie off, whatever those slopes explain must
-    therefore tell nothing of the other pictures.
+    colour. Whatever those slopes explain must therefore tell nothing of the other pictures, or
+    these would explain what is still misplaced, and it would stay so.
+
+    Parameters
+    ----------
+    first : array, (M, 1)
+    products : array, (M, M)
+        Inner products of the units' values, in units of the noise.
+    moved : array, (M, 2 K)
+        Products of the values with how the first picture changes when it moves.
+    moves : array, (2 K, 2 K)
+        Products of those changes.
+    count : int
+        Number of values of each unit.
+    rank : int
+        Most pictures.
+
+    Returns
+    -------
+    share : array, (M, R), orthonormal
+    rest : array, (M, M)
+        Inverse covariance of what the units see beside the first picture, of which nothing is
+        known beforehand: noise of variance one, and the other pictures as strong as they are.
     """
-    first, moves = aligned.share[:, :1], aligned.moves
-    moves = moves + 1e-6 * np.trace(moves) / len(moves) * np.eye(len(moves))
     rest = np.eye(len(first)) - first @ first.T
-    shifts = rest @ aligned.moved @ np.linalg.solve(moves, aligned.moved.T) @ rest
-    strength, vectors = np.linalg.eigh(rest @ products @ rest - shifts)
+    most = min(rank, len(first) // 6)
+    if most < 2:
+        return first, rest
+    moves = moves + 1e-6 * np.trace(moves) / len(moves) * np.eye(len(moves))
+    moved = rest @ moved
+    shifts = moved @ np.linalg.solve(moves, moved.T)
+    strength, vectors = _eigen(rest @ products @ rest - shifts)
     # Slopes are differences, and do not explain all that a shift has made.
-    least = max(_FAINT * aligned.values.shape[1], 0.1 * np.linalg.eigvalsh(shifts)[-1])
-    clear = int(np.sum(strength > least))
-    more = max(0, min(_RANK, len(first) // 6, clear + 1) - 1)
-    return np.hstack([first, vectors[:, ::-1][:, :more]])
+    least = max(_FAINT * count, 0.1 * _eigen(shifts)[0][-1])
+    some = np.flatnonzero(strength > least)[::-1][: most - 1]
+    others = vectors[:, some]
+    weight = 1 - 1 / (1 + _ALIKE * (strength[some] / count - 1))
+    return np.hstack([first, others]), rest - others * weight @ others.T
 
 
 def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
@@ -306,19 +354,17 @@ def _single(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
     uncertainty : array, (4, M, 2), px
         Standard deviation by the noise.
     """
-    products = (aligned.values @ aligned.values.T).astype(float)
-    share, first = _unmoved(aligned, products), aligned.share[:, 0]
+    first, rest, products = aligned.share[:, 0], aligned.rest, aligned.products
     values = aligned.values.reshape(-1, 2, *aligned.shape)
     slopes = aligned.slopes[0].reshape(2, 2, *aligned.shape)
     rows, columns = ((slice(0, size // 2), slice(size // 2, size)) for size in aligned.shape)
-    free = np.eye(len(first)) - share @ share.T
-    left = np.diag(free @ products @ free) / np.diag(free) / aligned.values.shape[1]
+    left = np.diag(rest @ products @ rest) / np.diag(rest) / aligned.values.shape[1]
     scale = 1 / (aligned.shared * np.maximum(left, 1e-6))[:, None]  # other colours are no noise
     shifts, doubts = [], []
     for quarter in [(..., row, column) for row in rows for column in columns]:
         rise = slopes[quarter].reshape(2, -1)
-        pull = -first[:, None] * (free @ (values[quarter].reshape(len(first), -1) @ rise.T))
-        precision = (first**2 * np.diag(free))[:, None, None] * (rise @ rise.T)
+        pull = -first[:, None] * (rest @ _product(values[quarter].reshape(len(first), -1), rise))
+        precision = (first**2 * np.diag(rest))[:, None, None] * (rise @ rise.T)
         covariance = np.linalg.inv(precision * scale[..., None] + 1e-3 * np.eye(2))
         shifts.append(np.einsum("mab,mb->ma", covariance, pull * scale))
         doubts.append(np.sqrt(np.einsum("maa->ma", covariance)))
@@ -337,7 +383,7 @@ def _agreement(one: np.ndarray, other: np.ndarray) -> float:
     How the units are weighted is learnt from the other half: what they have in common by chance
     then does not count. `one` and `other` hold the units' inner products there, (M, M).
     """
-    share = np.linalg.eigh(one)[1][:, -1]
+    share = _eigen(one)[1][:, -1]
     energy, shared = np.diag(other), other @ share
     rest = share @ shared - 2 * share * shared + share**2 * energy  # of the others' picture
     alike = (shared - share * energy) / np.sqrt(np.maximum(rest * energy, 1e-12))
@@ -350,11 +396,10 @@ def _relief(aligned: Aligned, baseline: np.ndarray) -> np.ndarray:
     rank, points = share.shape[1], shape[0] * shape[1]
     along = (baseline.T[None] * share.T[:, None]).reshape(2 * rank, -1)  # (rank axis, M)
     slopes = aligned.slopes.reshape(2 * rank, -1)
-    misfit = along.astype(np.float32) @ aligned.values
-    misfit -= (along @ share).astype(np.float32) @ aligned.common
-    free = np.eye(len(share)) - share @ share.T
+    along_rest = along @ aligned.rest
+    misfit = _product(along_rest, aligned.values.T)
     pull = -(misfit * slopes).sum(0)
-    precision = ((along @ free @ along.T).astype(np.float32) @ slopes * slopes).sum(0)
+    precision = ((along_rest @ along.T).astype(np.float32) @ slopes * slopes).sum(0)
     rows, columns = (np.arange(size) * _PARTS // size for size in shape)
     part = (rows[:, None] * _PARTS + columns).ravel()
     sums = [
@@ -421,8 +466,6 @@ def _solve(evidence: Evidence, lattice: Lattice, plane, offset, free: float):
 
 def _search(edges: Edges, lattice: Lattice, first: np.ndarray, span: tuple[float, float]) -> float:
     """Return the disparity at which all pairs of units together agree best, px per pitch."""
-    import torch
-
     reach = _reach(lattice)
     room = int(np.ceil(max(map(abs, span)) * reach / edges.step))  # or what leaves comes back
     taper = _taper(edges.values.shape[2])[:, None] * _taper(edges.values.shape[3])
@@ -446,8 +489,6 @@ def _search(edges: Edges, lattice: Lattice, first: np.ndarray, span: tuple[float
 
 def _low(size: int):
     """Return the indices of the frequencies below a quarter of the sampling rate."""
-    import torch
-
     return torch.cat([torch.arange(size // 4), torch.arange(size - size // 4, size)])
 
 

@@ -10,6 +10,9 @@ from squilla.calibration.resample import sinc_kernel
 STALE = 0.1
 """Shifts of units across their baselines from which on a lattice is taken to have moved, px."""
 
+_SURELY = 3.0
+"""Standard deviations of chance beyond which units are believed to lie off."""
+
 COSTLY = 0.02
 """Expected colour error from which on a person is warned."""
 
@@ -60,7 +63,7 @@ def _alike(shift: np.ndarray, noise: np.ndarray) -> float:
     weight = (1 / total + STALE**2) ** -2.0
     # Of four quarters alike, each with four times the variance: what the noise alone may reach.
     by_chance = np.sqrt(np.sum((weight / total) ** 2 * 8 / 3)) / weight.sum()
-    return float(np.average(square, weights=weight) - by_chance)
+    return float(np.average(square, weights=weight) - _SURELY * by_chance)
 
 
 def colour_error(y: Tensor, noise: np.ndarray, shift: float) -> float:
