@@ -19,7 +19,7 @@ from squilla.calibration.rehearsal import ideal_calibration
 from squilla.camera.scenes import load_scene
 from squilla.camera.twin import Camera
 from squilla.reconstruction.judgement import judge
-from squilla.reconstruction.reconstructor import load_model
+from squilla.reconstruction.models import load_model
 
 RESULTS = Path(__file__).parents[1] / "experiments" / "results" / "judgement.json"
 

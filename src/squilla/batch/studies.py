@@ -41,7 +41,7 @@ def noise(
     from squilla.calibration.alignment import measure
     from squilla.camera.scenes import load_scene
     from squilla.evaluation.metrics import evaluate
-    from squilla.reconstruction.reconstructor import load_model
+    from squilla.reconstruction.models import load_model
 
     twin, known = _camera(camera, calibration)
     picture = load_scene(scene, twin.design.wavelength, twin.design.field.size)
