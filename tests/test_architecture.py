@@ -12,7 +12,7 @@ import squilla
 SOURCE = Path(squilla.__file__).parent
 ORDER = (
     "errors", "threads", "spectra", "priors", "colour", "files", "optics", "camera", "calibration",
-    "reconstruction", "training", "evaluation", "live", "batch", "demo", "cli",
+    "reconstruction", "training", "evaluation", "live", "batch", "demo", "cli", "__main__",
 )  # fmt: skip
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init__.py")
 

@@ -330,3 +330,18 @@ def test_an_interrupted_training_goes_on(tmp_path, monkeypatch):
             train_compound(CAMERA, **setting, **files)
         with pytest.raises(InputError, match="not a checkpoint"):
             from_checkpoint(files["checkpoint"], setting["prior"])
+
+
+def test_a_checkpoint_serves_only_the_cameras_that_it_was_trained_for(tmp_path):
+    setting = {"recipe": Recipe(steps=1, scenes=1, cameras=1), "progress": False}
+    setting |= {"prior": broad_prior().on(CAMERA.wavelength), "checkpoint": tmp_path / "one"}
+    train_compound(CAMERA, **setting)
+    other = Calibration.from_sensitivity(1.1 * CAMERA.sensitivity, CAMERA.wavelength, CAMERA.angle)
+    with pytest.raises(InputError, match="checkpoint of another training"):
+        train_compound(other, **setting)
+
+
+def test_few_bands_are_refused_before_anything_is_learnt():
+    camera = Calibration.from_sensitivity(np.ones((8, 26)), np.linspace(500, 750, 26))
+    with pytest.raises(InputError, match="needs 32 bands or more, not 26"):
+        train_compound(camera)

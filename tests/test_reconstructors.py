@@ -424,3 +424,9 @@ def test_fingerprints_tell_cameras_apart():
     again = smooth_camera(0, filters=12, bands=48, angles=3)
     assert fingerprint(again) == fingerprint(CAMERA)
     assert fingerprint(changed(1.001, 0)) != fingerprint(CAMERA)
+
+
+@pytest.mark.parametrize("name", ["ridge", "compound"])
+def test_only_measurements_are_reconstructed(name):
+    with pytest.raises(InputError, match="Only a measurement is reconstructed"):
+        load_model(name, CAMERA).reconstruct(np.ones((4, 4, CAMERA.filters)))

@@ -130,6 +130,10 @@ def measure(
         saturated, if a distance is so short that sub-images would shift by a whole pitch, or if
         one distance is given and one for every point wanted.
     """
+    if not isinstance(raw, Raw) or not isinstance(calibration, Calibration):
+        raise InputError(
+            "A measurement is made of a raw frame (read_raw) and a calibration (load_calibration)."
+        )
     lattice, pixels = _fitting(raw, calibration)
     shortest = lattice.distance(lattice.pitch)
     for given in (nearest, distance):
@@ -274,6 +278,12 @@ def _fitting(raw: Raw, calibration: Calibration) -> tuple[Lattice, Pixels]:
             f"The raw frame has {raw.frame.shape[0]} x {raw.frame.shape[1]} px, the calibration "
             f"was made for {pixels.bias.shape[0]} x {pixels.bias.shape[1]}: they are of different "
             "cameras or regions."
+        )
+    most = int(raw.frame[::8, ::8].max())
+    if most > 1.1 * pixels.saturation:
+        raise InputError(
+            f"The raw frame holds values up to {most}, the calibrated sensor ends at "
+            f"{pixels.saturation:.0f}: its bits were shifted or it is of another camera."
         )
     taken, made = raw.metadata.get("camera"), calibration.provenance.get("camera")
     if taken and made and taken != made:

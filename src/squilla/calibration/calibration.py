@@ -151,8 +151,6 @@ class Calibration:
         nanometres(self.wavelength)
         if not np.all(np.diff(self.angle) > 0):
             raise InputError("The angles of a calibration must increase.")
-        if not self.sensitivity.mean() > 0:
-            raise InputError("The sensitivity is not positive on the whole; is its sign right?")
         if self.deviations is not None and (
             self.deviations.shape[1:] != expected or not np.all(np.isfinite(self.deviations))
         ):
@@ -195,6 +193,8 @@ class Calibration:
             raise InputError(
                 f"A response matrix has the shape (filters, wavelengths), not {sensitivity.shape}."
             )
+        if sensitivity.mean() < 0:
+            raise InputError("The response matrix is negative on the whole; is its sign right?")
         angle = np.zeros(1) if angle is None else np.asarray(angle, float)
         return cls(np.asarray(wavelength, float), sensitivity, angle)
 

@@ -305,7 +305,12 @@ def _without_stray_light(
 
 
 def _check_cover(wavelength: np.ndarray, grid: np.ndarray) -> None:
-    low, high = (wavelength.min(), wavelength.max()) if len(wavelength) else (np.inf, -np.inf)
+    if not len(wavelength):
+        raise InputError(
+            f"No step of the sweep lies in the camera's band, {grid[0]:g}-{grid[-1]:g} nm; are its "
+            "wavelengths in nm?"
+        )
+    low, high = wavelength.min(), wavelength.max()
     reach = max(float(np.diff(np.sort(wavelength)).max(initial=0)), grid[1] - grid[0])
     if low > grid[0] + reach or high < grid[-1] - reach:
         raise InputError(

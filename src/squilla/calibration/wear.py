@@ -217,8 +217,8 @@ def warn_of_wear(told: dict[str, Any], signal: float, count: int) -> None:
     says = []
     if told["worn_units"] != "none":
         says.append(
-            f"Units do not see what the others do: {told['worn_units']} of their light is there; "
-            "their channels are left out. Look for dust, or calibrate anew."
+            "Some units do not see what the others do (in brackets what they pass of their light): "
+            f"{told['worn_units']}; their channels are left out. Look for dust, or calibrate anew."
         )
     if told["lost_rows"]:
         says.append(f"{told['lost_rows']} rows of the frame were lost on their way; left out.")

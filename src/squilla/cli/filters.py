@@ -318,7 +318,9 @@ def _filters(
     from squilla.optics.filters import FilterArray, read_filters
     from squilla.spectra import grid
 
-    if Path(name).suffix:
+    path = Path(name)
+    design = path.suffix == ".toml" and path.is_file() and "[array]" in path.read_text("utf-8")
+    if path.suffix and not design:
         if seed is not None:
             raise InputError(f"--seed draws the filters of a camera; those of {name} are drawn.")
         array = read_filters(name, wavelength=wavelength)

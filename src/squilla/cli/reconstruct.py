@@ -81,6 +81,10 @@ def reconstruct(
         f"{output}: {told['snr']:.1f} dB, {relief if depth else plane}"
         f"{told['alignment_score']:.2f})"
     )
+    if told.get("flagged", 0.0) > 0.01:
+        typer.echo(
+            f"  {told['flagged']:.0%} of the pixels are not to be believed; see squilla evaluate"
+        )
     if engine is not None:
         away = cube.attrs["model_engine_error"]
         typer.echo(f"  {engine}: {away:.1e} from PyTorch in float32 (rms over rms)")

@@ -45,9 +45,7 @@ def assemble(
     if not cubes:
         raise InputError(f"{path} holds no cube: no array in it has three axes.")
     if not vectors:
-        raise InputError(
-            f"{path} tells no wavelengths; give them with wavelength=, one for each band, in nm."
-        )
+        raise InputError(f"{path} tells no wavelengths; give them, one for each band, in nm.")
     fits = [
         (name, axis, vector)
         for name, cube in cubes.items()

@@ -84,6 +84,8 @@ def save(
     suffix = path.suffix.lower()
     if suffix not in CUBE_SUFFIXES:
         raise InputError(f"{path} must end in one of {', '.join(CUBE_SUFFIXES)} to be written.")
+    if not isinstance(cube, DataArray):
+        raise InputError("A cube to be saved has its wavelengths; make one with labelled.")
     arrays = {str(cube.name or "cube"): _checked(cube)}
     if extra and not arrays.keys().isdisjoint(extra):
         raise InputError(f"An extra has the name of the cube itself, {cube.name!r}; rename it.")
@@ -246,16 +248,14 @@ def _plain(array: DataArray) -> DataArray:
 def _in_nanometres(cube: DataArray, path: Path) -> DataArray:
     """Return the cube with its wavelengths in nm, increasing; refuse it if they cannot be had."""
     if "wavelength" not in cube.coords:
-        raise InputError(
-            f"{path} tells no wavelengths; give them with wavelength=, one for each band, in nm."
-        )
+        raise InputError(f"{path} tells no wavelengths; give them, one for each band, in nm.")
     stated = cube["wavelength"]
     factor = _unit(str(stated.attrs.get("units", "")), stated.values, path)
     wavelength = stated.values.astype(float) * factor
     if not (np.isfinite(wavelength).all() and 100 <= wavelength.min() <= wavelength.max() <= 5e4):
         raise InputError(
             f"{path}: wavelengths from {wavelength.min():g} to {wavelength.max():g} nm make no "
-            "sense; give the right ones with wavelength=, in nm."
+            "sense; give the right ones, in nm."
         )
     result = cube.assign_coords(wavelength=("wavelength", wavelength, _CF))
     if "fwhm" in cube.coords:
@@ -339,6 +339,8 @@ def _open_dataset(
                     path, "r"
                 ).close()  # says in plain words what is wrong with a damaged file
         dataset = xr.open_dataset(path, decode_times=False, cache=False, **how)
+        if "sensitivity" in dataset and "cube" not in dataset.attrs:
+            raise InputError(f"{path} is a calibration, no cube.")
         arrays = {str(name): dataset[name] for name in dataset.variables}
         arrays = {name: each for name, each in arrays.items() if each.dtype.kind in "iufb"}
         check_size(path, sum(each.nbytes for each in arrays.values()))

@@ -92,6 +92,9 @@ class WhiteNoise:
         if not -300 <= self.snr <= 300:  # beyond, its power is no number any more
             raise InputError(f"The SNR must be a number of dB from -300 to 300, not {self.snr:g}.")
 
+    def __str__(self) -> str:
+        return f"{self.snr:g} dB"
+
     def variance(self, sensitivity: Tensor, prior: Prior) -> Tensor:
         square = ((sensitivity @ prior.moment) * sensitivity).sum(-1)
         power = square.mean(-1, keepdim=True) * 10 ** (-self.snr / 10)
@@ -121,6 +124,9 @@ class PhotonNoise:
                 f"An exposure of {self.exposure:g} e- with a read noise of {self.read_noise:g} e- "
                 "cannot be; give an exposure above 0 and a read noise of 0 or more."
             )
+
+    def __str__(self) -> str:
+        return f"{self.exposure:g} e- of light, {self.read_noise:g} e- of read noise"
 
     def variance(self, sensitivity: Tensor, prior: Prior) -> Tensor:
         per_electron = (self.clear * prior.mean).sum() / self.exposure

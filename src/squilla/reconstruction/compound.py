@@ -37,7 +37,13 @@ from squilla.reconstruction.evidence import (
 )
 from squilla.reconstruction.partial import CodedReconstruction, Reconstruction
 from squilla.reconstruction.prior import Prior, broad_prior
-from squilla.reconstruction.reconstructor import Reconstructor, Scale, check_scale, picture
+from squilla.reconstruction.reconstructor import (
+    Reconstructor,
+    Scale,
+    check_measurement,
+    check_scale,
+    picture,
+)
 
 if TYPE_CHECKING:
     from xarray import DataArray
@@ -326,6 +332,7 @@ class Compound(Reconstructor):
         """
         from squilla.reconstruction.linear import complete, counted
 
+        check_measurement(measurement)
         y = torch.as_tensor(measurement.y, dtype=torch.float32)
         y, angle, snr = self._accepted(picture(y), measurement.angle, measurement.snr)
         valid = torch.as_tensor(measurement.valid, dtype=torch.bool)

@@ -252,6 +252,7 @@ class Reconstructor(nn.Module):
         """
         from squilla.reconstruction.linear import complete
 
+        check_measurement(measurement)
         y = picture(torch.as_tensor(measurement.y, dtype=torch.float32))
         y, angle, snr = self._accepted(y, measurement.angle, measurement.snr)
         y = complete(y, measurement.valid, self.calibration, angle, snr)
@@ -345,6 +346,15 @@ def _probe(calibration: Calibration) -> Tensor:
     y = calibration.project(spectra[2 * half[:, None] + half])
     noise = torch.randn(y.shape, generator=generator)
     return y + 10**-1.5 * y.square().mean(-1, keepdim=True).sqrt() * noise
+
+
+def check_measurement(measurement: Measurement) -> None:
+    """Raise InputError unless it is a measurement."""
+    if not isinstance(measurement, Measurement):
+        raise InputError(
+            "Only a measurement is reconstructed: make one with measure, or of aligned channels "
+            "with Measurement.of."
+        )
 
 
 def check_scale(scale: str) -> None:

@@ -1,6 +1,7 @@
 """Training of the compound model: many cameras, many scenes, every noise."""
 
 import copy
+import hashlib
 import json
 import math
 import time
@@ -19,6 +20,7 @@ from squilla.errors import InputError
 from squilla.files.disk import replacing
 from squilla.reconstruction.compound import ZONES, BackEnd, Compound
 from squilla.reconstruction.evidence import (
+    CORRECTED,
     LEVELS,
     Camera,
     Evidence,
@@ -226,7 +228,7 @@ def losses(
     return apart.square().mean((1, 2)), score, cover
 
 
-_PARTS = ("recipe", "step", "history", "back", "averaged", "optimiser")
+_PARTS = ("recipe", "cameras", "step", "history", "back", "averaged", "optimiser")
 """Of a checkpoint."""
 
 
@@ -235,6 +237,10 @@ class _Run:
 
     def __init__(self, prior: Prior, responses: Sequence[Tensor], recipe: Recipe, device):
         self.recipe, self.device = recipe, device
+        digest = hashlib.sha256(prior.basis.double().cpu().numpy().tobytes())
+        for response in responses:
+            digest.update(response.double().cpu().numpy().tobytes())
+        self.cameras = digest.hexdigest()
         flat = Calibration.from_sensitivity(responses[0].numpy(), prior.wavelength)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.seed)
@@ -299,19 +305,20 @@ class _Run:
         """Write everything from which `resume` goes on."""
         state = {
             "recipe": vars(self.recipe) | {},
+            "cameras": self.cameras,
             "step": self.step,
             "history": self.history,
             "back": self.model.back.state_dict(),
             "averaged": self.averaged.state_dict(),
             "optimiser": self.optimiser.state_dict(),
         }
-        with replacing(path) as temporary:
-            torch.save(state, temporary)
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            torch.save(state, file)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of the same training."""
         state = read_checkpoint(path, _PARTS)
-        if state["recipe"] != vars(self.recipe):
+        if (state["recipe"], state["cameras"]) != (vars(self.recipe), self.cameras):
             raise InputError(
                 f"{path} is the checkpoint of another training; remove it or name another file."
             )
@@ -377,7 +384,17 @@ def train_compound(
     -------
     Compound
         On the CPU, in evaluation mode, with the weights averaged over the last steps.
+
+    Raises
+    ------
+    InputError
+        If the camera has too few bands, the checkpoint is of another training, or it diverges.
     """
+    if calibration is not None and len(calibration.wavelength) < CORRECTED[-1]:
+        raise InputError(
+            f"`compound` needs {CORRECTED[-1]} bands or more, not {len(calibration.wavelength)}; "
+            "train one of the networks instead."
+        )
     recipe = Recipe() if recipe is None else recipe
     generator = Generator().manual_seed(recipe.seed)
     if calibration is None:
