@@ -114,6 +114,8 @@ def test_summary_follows_its_parts(pair):
     summary = evaluate(estimate, truth)
     assert summary["mse"] == pytest.approx(mse(estimate / peak, truth / peak).mean(), rel=1e-5)
     assert summary["rmse"] == pytest.approx(np.sqrt(summary["mse"]))
+    every = mse(estimate / peak, truth / peak)
+    assert summary["mse_median"] == pytest.approx(np.median(every), rel=1e-5)
     assert summary["mae"] == pytest.approx(mae(estimate / peak, truth / peak).mean(), rel=1e-5)
     assert summary["sam_deg"] == pytest.approx(np.degrees(sam(estimate, truth)).mean(), rel=1e-5)
     assert summary["gfc"] == pytest.approx(gfc(estimate, truth).mean(), rel=1e-5)

@@ -192,6 +192,7 @@ def evaluate(
     -------
     dict
         mse, rmse, mae : mean over pixels and bands, 1 being the maximum of each true spectrum;
+        mse_median : the median over pixels instead, which few dark ones beside bright ones leave;
         psnr_db : of the radiance itself, with the scene's maximum as peak;
         sam_deg, gfc : means over the pixels;
         ssim : mean over the bands; NaN for lists of spectra and pictures below 7 px;
@@ -225,7 +226,8 @@ def evaluate(
         error, cosine = mse(x, y), _cosine(x, y)
         angle = np.arccos(np.clip(cosine, -1, 1))
         rows.append([error, mae(x, y), error * scale**2, angle, np.abs(cosine)])
-    error, absolute, raw, angle, similar = np.concatenate(rows, -1).mean(-1)
+    every = np.concatenate(rows, -1)
+    error, absolute, raw, angle, similar = every.mean(-1)
     similarity = np.nan
     if truth.ndim == 3 and min(truth.shape[:2]) >= _WINDOW:
         seen, true = (np.where(keep[..., None], each, 0) for each in (estimate, truth))
@@ -234,6 +236,7 @@ def evaluate(
         ratio = 10 * np.log10(float(brightest) ** 2 / raw)
     return {
         "mse": float(error),
+        "mse_median": float(np.median(every[0])),
         "rmse": float(np.sqrt(error)),
         "mae": float(absolute),
         "psnr_db": float(ratio),
