@@ -196,7 +196,7 @@ class Effects(_Section):
 
     @classmethod
     def none(cls) -> "Effects":
-        """Return the ideal camera: every effect switched off."""
+        """Return all of them switched off."""
         return cls(**dict.fromkeys(cls.model_fields, False))
 
 
