@@ -156,7 +156,7 @@ class Rehearsal:
         """
         own = {"dark": self.dark, "flat": self.flat, "sweep": self.sweep, "target": self.target}
         frames = {name: take() for name, take in own.items() if name not in lessons}
-        given = {"target_distance": self.distance} | frames | lessons
+        given: dict[str, Any] = {"target_distance": self.distance, **frames, **lessons}
         return calibrate(self.camera.design, **given)
 
     def _band(self, wavelength: float) -> np.ndarray:
