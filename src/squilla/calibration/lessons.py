@@ -46,14 +46,13 @@ def read_known(folder: Path, wavelength: np.ndarray) -> Iterator[KnownScene]:
     first surface, 0 where none) and distance (mm). The spectra come on `wavelength`, (K,) nm.
     """
     listed = read_listed(folder / "known.csv", _KNOWN, ("distance",))
-    return (_known(*paths, distance, wavelength) for paths, (distance,) in listed)
+    return (_known(paths, distance, wavelength) for paths, (distance,) in listed)
 
 
-def _known(
-    frame: Path, spectra: Path, labels: Path, distance: float, wavelength: np.ndarray
-) -> KnownScene:
+def _known(paths: list[Path], distance: float, wavelength: np.ndarray) -> KnownScene:
     from PIL import Image, UnidentifiedImageError
 
+    frame, spectra, labels = paths
     columns = read_columns(spectra)[0].T
     try:
         with Image.open(labels) as picture:
