@@ -59,8 +59,8 @@ def demo(
 ) -> dict:
     """Capture, calibrate, align, reconstruct, judge, draw.
 
-    Writes raw frames, ``calibration.nc``, the cubes as .nc and .hdr, the truth as .nc,
-    ``metrics.json`` and ``report.html``.
+    Writes raw frames, ``calibration.nc``, the cubes as .nc and .hdr, ``metrics.json`` and
+    ``report.html``.
 
     Parameters
     ----------
@@ -135,7 +135,6 @@ def demo(
                 for suffix in (".nc", ".hdr"):
                     save(cubes[model], folder / f"{name}-{model}{suffix}")
             truth = twin.truth(scene, distance=distance, depth=relief)
-            save(truth.cube.rename("radiance"), folder / f"truth{f'-{name}' if number else ''}.nc")
             trial = _trial(name, truth, cubes, seconds, raw, calibration, measurement)
             trials.append(trial)
             metrics[name] = {
