@@ -14,7 +14,7 @@ from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.depth import Depth, find_depth
 from squilla.calibration.disparity import find_plane, fit_plane, plane_map
 from squilla.calibration.edges import find_edges
-from squilla.calibration.quality import COSTLY, STALE, colour_error, drift, misalignment
+from squilla.calibration.quality import COSTLY, STALE, colour_error, drift, looseness, misalignment
 from squilla.calibration.resample import SINC, resample
 from squilla.calibration.stray import stray_light
 from squilla.calibration.views import SubImages, evened, inner, sub_images
@@ -336,7 +336,8 @@ def place(
     span = (0.0, largest)
     found = find_plane(edges, lattice, first, span, start=start)
     moved = drift(found, lattice)
-    if refine or (refine is None and moved > STALE and found.score > _CLEAR):
+    told = moved > max(STALE, 1.5 * looseness(found)) and found.score > _CLEAR
+    if refine or (refine is None and told):
         free = max(moved, STALE)
         found = find_plane(edges, lattice, first, span, start=found.plane, free=free)
         moved = drift(found, lattice)

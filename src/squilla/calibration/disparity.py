@@ -256,7 +256,7 @@ def _products(values: np.ndarray) -> list[np.ndarray]:
     parts = values.reshape(len(values), 2, -1)
     middle = parts.shape[2] // 2
     return [
-        sum(_product(half[:, c], half[:, c]).astype(float) for c in (0, 1))
+        (_product(half[:, 0], half[:, 0]) + _product(half[:, 1], half[:, 1])).astype(float)
         for half in (parts[..., :middle], parts[..., middle:])
     ]
 

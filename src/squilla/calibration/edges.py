@@ -41,12 +41,6 @@ class Edges:
         """
         return max(1.0, 2 * np.pi * (self.smooth / self.step) ** 2)
 
-    def thinned(self) -> "Edges":
-        """Return the same at every second point."""
-        few = (..., slice(None, None, 2), slice(None, None, 2))
-        values, bad = (np.ascontiguousarray(each[few]) for each in (self.values, self.bad))
-        return Edges(values, bad, 2 * self.step, self.smooth)
-
     def directions(self) -> "Edges":
         """Return the double-angle gradient of gradients, at half their resolution."""
         # The weakest edges are noise: their direction is shrunk to nothing.

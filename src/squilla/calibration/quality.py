@@ -27,12 +27,17 @@ def misalignment(found: Placement, lattice: Lattice) -> float:
     length = float(np.mean(lattice.baseline**2))
     plane = length * float(np.diag(found.covariance) @ [1, 1 / 3, 1 / 3])  # y^2, x^2 over -1..1
     if found.offset.any():  # were single units free, they followed their noise
-        units = float(np.mean(np.sum(found.uncertainty**-2.0, 0) ** -1))
+        units = looseness(found) ** 2
     else:
         units = _alike(found.leftover, found.uncertainty)
         units = units if units > STALE**2 else 0.0
     relief = length * float(np.median(found.relief**2 - found.flatness**2))
     return float(np.sqrt(plane + units + max(relief, 0)))
+
+
+def looseness(found: Placement) -> float:
+    """Return how uncertain single units' places are by the noise, RMS px per axis."""
+    return float(np.sqrt(np.mean(np.sum(found.uncertainty**-2.0, 0) ** -1)))
 
 
 def drift(found: Placement, lattice: Lattice) -> float:
