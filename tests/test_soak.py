@@ -166,7 +166,7 @@ def test_a_hard_time_leaves_nothing_behind(camera, scene, calibration, tmp_path,
         while time.monotonic() < end:
             time.sleep(min(2.0, MINUTES))
             held.append(memory())
-            for file in (tmp_path / "raw").glob("*.tiff"):
+            for file in (tmp_path / "raw").glob("frame-*.tiff"):
                 file.unlink()
         numbered = source._number
         ended.set()

@@ -16,6 +16,7 @@ class _Blas:
     """The BLAS libraries of this process, and how many want them on one thread."""
 
     def __init__(self) -> None:
+        import scipy.linalg.cython_blas  # noqa: F401  # where compiled loops have theirs from
         from threadpoolctl import ThreadpoolController
 
         self.lock, self.wishes = Lock(), 0
