@@ -58,7 +58,6 @@ class Line:
             sock=line,
             compression=None,
             max_size=None,
-            ping_interval=None,  # a machine at work may answer late; that is no fault
         )
         self.hello, _ = unpack(self.socket.recv())
 
