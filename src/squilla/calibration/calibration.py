@@ -149,8 +149,8 @@ class Calibration:
         if not np.all(np.isfinite(self.sensitivity)):
             raise InputError("The sensitivity holds NaN or infinite values; repair the table.")
         nanometres(self.wavelength)
-        if not np.all(np.diff(self.angle) > 0):
-            raise InputError("The angles of a calibration must increase.")
+        if not (np.all(np.diff(self.wavelength) > 0) and np.all(np.diff(self.angle) > 0)):
+            raise InputError("The wavelengths and the angles of a calibration must increase.")
         if self.deviations is not None and (
             self.deviations.shape[1:] != expected or not np.all(np.isfinite(self.deviations))
         ):

@@ -38,6 +38,8 @@ class MeasuredFilters:
         if not np.isfinite(self.values).all():
             raise InputError("The filter table holds NaN or infinite values; repair the table.")
         nanometres(self.wavelength)
+        if not np.all(np.diff(self.wavelength) > 0):
+            raise InputError("The wavelengths of a filter table must increase.")
         if self.effective_index is not None and not self.effective_index >= 1:
             raise InputError(
                 f"The effective index is {self.effective_index}; it must be 1 or more."
