@@ -28,7 +28,7 @@ from scipy import ndimage
 from squilla.calibration.alignment import align, measure, place
 from squilla.calibration.calibration import Calibration, Lattice, Pixels
 from squilla.calibration.disparity import find_plane, plane_map
-from squilla.calibration.edges import find_edges
+from squilla.calibration.edges import Edges, find_edges
 from squilla.calibration.rehearsal import poster
 from squilla.calibration.resample import monomials
 from squilla.calibration.views import SubImages, evened, sub_images
@@ -37,6 +37,7 @@ from squilla.camera.scenes import load_scene
 from squilla.camera.twin import Camera
 from squilla.files.raw import Raw
 from squilla.spectra import lights
+from squilla.threads import single_threaded_products
 
 RESULTS = Path(__file__).parent.parent / "experiments" / "results" / "alignment.json"
 WAVELENGTH = np.arange(500.0, 751.0)
@@ -450,14 +451,18 @@ def speed() -> None:
         print(f"| {name} | {1000 * np.median(wall):.1f} | {1000 * min(work):.1f} |", flush=True)
         return result
 
+    def placed(edges: Edges, first: np.ndarray, start: np.ndarray | None):
+        with single_threaded_products():  # as in `measure`
+            return find_plane(edges, lattice, first, (0, lattice.disparity(60)), start=start)
+
     for name, margin, start in (("cold", 46, None), ("warm", 26, warm + np.array([0.05, 0.01, 0]))):
         views = timed(f"{name}: correct the frame", lambda m=margin: sub_images(
             raw, lattice, pixels, m))  # fmt: skip
         noise = views.image.mean((1, 2)).numpy() / pixels.gain + 1
         edges = timed(f"{name}: gradients", lambda v=views, n=noise, s=start: find_edges(
             v.image.numpy(), v.bad.numpy(), n, step=2 if s is None else 4))  # fmt: skip
-        timed(f"{name}: plane", lambda e=edges, v=views, s=start: find_plane(
-            e, lattice, v.margin + v.offset, (0, lattice.disparity(60)), start=s))  # fmt: skip
+        timed(f"{name}: plane", lambda e=edges, v=views, s=start: placed(
+            e, v.margin + v.offset, s))  # fmt: skip
         flat = plane_map(warm, lattice)
         timed(f"{name}: resample", lambda v=views, f=flat: align(v, lattice, f))
     timed("measure, cold", lambda: measure(raw, calibration))
