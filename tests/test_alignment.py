@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from conftest import small_design
 from squilla import align_stack
-from squilla.calibration.alignment import align, place
+from squilla.calibration.alignment import align, measure, place
 from squilla.calibration.bundle import lattice_from_shots
 from squilla.calibration.calibration import Lattice
 from squilla.calibration.disparity import find_plane, fit_plane, plane_map
@@ -418,3 +418,15 @@ def test_windows_of_a_single_row_are_found(shape):
     found = find_windows(flat, shape, design.pitch * wider)
     middle = design.centres.mean(0)
     assert rms(found - (middle + (design.centres - middle) * wider)) < 0.1
+
+
+def test_a_frame_of_shifted_bits_is_refused(camera, calibration, scene):
+    raw = camera.capture(scene, snr=30, generator=torch.Generator().manual_seed(3))
+    shifted = replace(raw, frame=raw.frame << 4)
+    with pytest.raises(InputError, match="bits were shifted"):
+        measure(shifted, calibration)
+
+
+def test_a_path_is_no_raw_frame(calibration):
+    with pytest.raises(InputError, match="made of a raw frame"):
+        measure("raw.tiff", calibration)
