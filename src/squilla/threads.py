@@ -7,7 +7,7 @@ small product on two threads costs more than a large one on a single thread.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from threading import Lock
 from typing import Any
 
@@ -17,9 +17,11 @@ class _Blas:
 
     def __init__(self) -> None:
         import scipy.linalg.cython_blas  # noqa: F401  # where compiled loops have theirs from
-        from threadpoolctl import ThreadpoolController
+        from threadpoolctl import OpenBLASController, ThreadpoolController
 
         self.lock, self.wishes = Lock(), 0
+        # Only the thread that first set a limit may set another, were it not for this.
+        self.free = partial(OpenBLASController.clear_controlling_thread, force=True)
         self.libraries = ThreadpoolController().select(user_api="blas")
         self.limit: Any = None
 
@@ -38,6 +40,7 @@ def single_threaded_products() -> Iterator[None]:
     blas = _blas()
     with blas.lock:
         if not blas.wishes:
+            blas.free()
             blas.limit = blas.libraries.limit(limits=1)
         blas.wishes += 1
     try:
@@ -46,4 +49,5 @@ def single_threaded_products() -> Iterator[None]:
         with blas.lock:
             blas.wishes -= 1
             if not blas.wishes:
+                blas.free()
                 blas.limit.restore_original_limits()

@@ -8,6 +8,7 @@ from collections import deque
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
+import numba
 import numpy as np
 from numba.np.ufunc.parallel import threading_layer
 
@@ -154,6 +155,8 @@ class LiveSource:
     # --- the thread -----------------------------------------------------------------------------
 
     def _run(self) -> None:
+        # One frame is measured while another is reconstructed: each by half of the cores.
+        numba.set_num_threads(max(1, numba.get_num_threads() // 2))
         while not self._ended.is_set():
             try:
                 start = time.perf_counter()
