@@ -110,6 +110,12 @@ class Pixels:
         lit = part.reshape(rows, DARK_BLOCK, columns, DARK_BLOCK).any((1, 3))
         return DARK_BLOCK * np.argwhere(maximum_filter(lit, 7) == 0)
 
+    @cached_property
+    def dark_levels(self) -> np.ndarray:
+        """The bias and the dark rate of the blocks of `dark_blocks`, (2, N) float32."""
+        corners = tuple(self.dark_blocks.T)
+        return np.stack([self.bias[corners], self.dark_rate[corners]])
+
     def dark(self, exposure: float | None) -> np.ndarray:
         """Return what a frame of this exposure (ms) shows without light, (rows, columns) DN."""
         return self.bias + self.dark_rate * np.float32(exposure or 0.0)

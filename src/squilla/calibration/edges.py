@@ -134,14 +134,18 @@ def _gradient(images, bad, step, bell, slope, values, wrong):
         values[:, unit, row], wrong[unit, row] = 0, True
         if middle < reach or middle >= rows - reach:
             continue
-        smooth, steep = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-        spoilt = np.zeros(columns, np.uint8)
-        for k in range(len(bell)):
-            source, flags = images[unit, middle + k - reach], bad[unit, middle + k - reach]
-            a, b = bell[k], slope[k]
+        smooth, steep = bell[reach] * images[unit, middle], np.zeros(columns, np.float32)
+        for k in range(1, reach, 2):  # rows above and below, two of each at a time
+            a, b = images[unit, middle - k], images[unit, middle + k]
+            c, d = images[unit, middle - k - 1], images[unit, middle + k + 1]
+            p, q, r, t = bell[reach + k], bell[reach + k + 1], slope[reach + k], slope[reach + k + 1]
             for column in range(columns):
-                smooth[column] += a * source[column]
-                steep[column] += b * source[column]
+                smooth[column] += p * (a[column] + b[column]) + q * (c[column] + d[column])
+                steep[column] += r * (b[column] - a[column]) + t * (d[column] - c[column])
+        spoilt = np.zeros(columns, np.uint8)
+        for row_of_bad in range(middle - reach, middle + reach + 1):
+            flags = bad[unit, row_of_bad]
+            for column in range(columns):
                 spoilt[column] += flags[column]
         # Every step-th sample together, so that the compiler makes vector loops of what follows.
         length = columns // step

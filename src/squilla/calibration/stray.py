@@ -37,10 +37,9 @@ def stray_light(
         stray_light : a sentence; stray_share, stray_peak : mean and brightest of the dark parts
         against the signal, where there are any.
     """
-    blocks = pixels.dark_blocks
-    if not len(blocks):
+    if not len(pixels.dark_blocks):
         return {"stray_light": "not judged: the sub-images leave no part of the sensor dark"}
-    level = dark_levels(frame, exposure, pixels, blocks)
+    level = rise(frame, exposure, pixels)
     signal = max(signal, 1e-3)  # DN; of a frame that shows no picture at all
     share, peak = float(level.mean()) / signal, float(level.max()) / signal
     noise = 1.25 * np.sqrt((pixels.read_noise / pixels.gain) ** 2 + 1 / 12) / _BLOCK / signal
@@ -54,31 +53,40 @@ def stray_light(
     }
 
 
-def dark_levels(
-    frame: np.ndarray, exposure: float | None, pixels: Pixels, blocks: np.ndarray
+def rise(
+    frame: np.ndarray, exposure: float | None, pixels: Pixels, *, every: int = 1
 ) -> np.ndarray:
-    """Return by how much blocks, (N, 2) px, lie above the calibrated dark, (N,) DN."""
-    level = np.empty(len(blocks), np.float32)
-    _levels(frame, pixels.bias, pixels.dark_rate, np.float32(exposure or 0.0), blocks, level)
-    return level
+    """Return by how much every n-th dark block lies above its calibrated level, (N,) DN."""
+    blocks = pixels.dark_blocks[::every]
+    bias, rate = pixels.dark_levels[:, ::every]
+    total = np.empty(len(blocks), np.float32)
+    _middle(frame, blocks, total)
+    return total / np.float32(2 * _BLOCK) - bias - np.float32(exposure or 0.0) * rate
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
-def _levels(frame, bias, dark_rate, exposure, blocks, level):
+def _middle(frame, blocks, total):
+    """Fill in the sum of each block's two middle rows, were its rows ordered by their sums.
+
+    Not the mean: some rows may hold hot pixels. Dark parts have one dark level.
+    """
     parts = 64
     for part in numba.prange(parts):
-        mean = np.empty(_BLOCK, np.float32)
-        for number in range(part * len(blocks) // parts, (part + 1) * len(blocks) // parts):
-            y, x = blocks[number]
+        some = blocks[part * len(blocks) // parts : (part + 1) * len(blocks) // parts]
+        sums = np.empty((_BLOCK, len(some)), np.int32)
+        for number in range(len(some)):
+            y, x = some[number]
             for row in range(_BLOCK):
-                total = np.float32(0)
-                for column in range(x, x + _BLOCK):
-                    total += np.float32(frame[y + row, column])
-                place = row
-                while place > 0 and mean[place - 1] > total:  # in order
-                    mean[place] = mean[place - 1]
-                    place -= 1
-                mean[place] = total
-            # Not the mean: some rows may hold hot pixels. Dark parts have one dark level.
-            middle = (mean[_BLOCK // 2 - 1] + mean[_BLOCK // 2]) / (2 * _BLOCK)
-            level[number] = middle - bias[y, x] - exposure * dark_rate[y, x]
+                pixels, value = frame[y + row, x : x + _BLOCK], np.int32(0)
+                for column in range(_BLOCK):
+                    value += pixels[column]
+                sums[row, number] = value
+        for turn in range(_BLOCK):  # neighbours change places until all are in order
+            for row in range(turn % 2, _BLOCK - 1, 2):
+                low, high = sums[row], sums[row + 1]
+                for number in range(len(some)):
+                    one, other = low[number], high[number]
+                    low[number], high[number] = min(one, other), max(one, other)
+        middle = sums[_BLOCK // 2 - 1 : _BLOCK // 2 + 1]
+        for number in range(len(some)):
+            total[part * len(blocks) // parts + number] = middle[0, number] + middle[1, number]

@@ -95,15 +95,13 @@ def fill(image, bad):
     units, rows, columns = image.shape
     for line in numba.prange(units * rows):
         unit, row = line // rows, line % rows
-        count = 0
+        flags, some = bad[unit, row], False
         for column in range(columns):  # most lines are good, which a vector loop tells at once
-            count += bad[unit, row, column]
-        column = 0
-        while count:
-            if bad[unit, row, column]:
-                fill_one(image[unit], bad[unit], row, column)
-                count -= 1
-            column += 1
+            some |= flags[column]
+        if some:
+            for column in range(columns):
+                if flags[column]:
+                    fill_one(image[unit], bad[unit], row, column)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -14,7 +14,7 @@ import torch
 
 from squilla.calibration.agreement import Agreement
 from squilla.calibration.calibration import Pixels
-from squilla.calibration.stray import dark_levels
+from squilla.calibration.stray import rise
 from squilla.calibration.views import SubImages, fill_one
 from squilla.files.raw import Raw
 
@@ -82,10 +82,11 @@ def without_veil(raw: Raw, pixels: Pixels) -> tuple[Pixels, float]:
         the calibrated one is another bit depth, and no wear.
     """
     blocks = pixels.dark_blocks
-    blocks = blocks[:: len(blocks) // 1000 + 1]
+    every = len(blocks) // 1000 + 1
+    blocks = blocks[::every]
     if len(blocks) < 40:
         return pixels, 0.0
-    level = dark_levels(raw.frame, raw.exposure, pixels, blocks)
+    level = rise(raw.frame, raw.exposure, pixels, every=every)
     noise = np.sqrt((pixels.read_noise / pixels.gain) ** 2 + 1 / 12) / 8
     usual = float(np.median(level))
     if usual < max(5 * noise / np.sqrt(len(blocks)), 0.25):
@@ -161,24 +162,26 @@ def _find_odd(image, bad, floor, shot, odd, lines):
         unit, row = line // (rows - 2), line % (rows - 2) + 1
         above, here, below = image[unit, row - 1], image[unit, row], image[unit, row + 1]
         top, bottom = np.empty(columns, np.float32), np.empty(columns, np.float32)
-        for x in range(columns):
+        highest, lowest = np.empty(columns, np.float32), np.empty(columns, np.float32)
+        for x in range(columns):  # bad neighbours count as what they were filled with
             top[x], bottom[x] = max(above[x], below[x]), min(above[x], below[x])
-        out = np.empty(columns, np.float32)
-        most = np.float32(0)
-        for x in range(1, columns - 1):  # bad neighbours count as what they were filled with
-            left, right = max(top[x - 1], here[x - 1]), max(top[x + 1], here[x + 1])
-            high = max(top[x], max(left, right))
-            left, right = min(bottom[x - 1], here[x - 1]), min(bottom[x + 1], here[x + 1])
-            low = min(bottom[x], min(left, right))
-            out[x] = max(here[x] - high, low - here[x]) - (high - low)
-            most = max(most, out[x])
-        if not most > 0:
+            highest[x], lowest[x] = max(top[x], here[x]), min(bottom[x], here[x])
+        out = np.empty(columns - 2, np.float32)
+        left, right, least, last = highest[:-2], highest[2:], lowest[:-2], lowest[2:]
+        over, own, under = top[1:-1], here[1:-1], bottom[1:-1]
+        some = False
+        for x in range(columns - 2):
+            high = max(over[x], max(left[x], right[x]))
+            low = min(under[x], min(least[x], last[x]))
+            beyond = max(own[x] - high, low - own[x]) - (high - low)
+            noise = floor + shot * max(over[x], np.float32(0))
+            out[x] = beyond * abs(beyond) - np.float32(_OUT**2) * noise
+            some |= out[x] > 0
+        if not some:
             continue
-        for x in range(1, columns - 1):
-            if out[x] > 0 and not bad[unit, row, x]:
-                noise = floor + shot * max(top[x], np.float32(0))
-                if out[x] > _OUT * np.sqrt(noise):
-                    odd[unit, row, x] = lines[unit, row] = True
+        for x in range(columns - 2):
+            if out[x] > 0 and not bad[unit, row, x + 1]:
+                odd[unit, row, x + 1] = lines[unit, row] = True
 
 
 @numba.njit(cache=True, nogil=True)
