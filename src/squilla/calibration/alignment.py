@@ -15,7 +15,7 @@ from squilla.calibration.depth import Depth, find_depth
 from squilla.calibration.disparity import find_plane, fit_plane, plane_map
 from squilla.calibration.edges import find_edges
 from squilla.calibration.quality import COSTLY, STALE, colour_error, drift, looseness, misalignment
-from squilla.calibration.resample import SINC, resample
+from squilla.calibration.resample import SINC, resample, resample_smoothly
 from squilla.calibration.stray import stray_light
 from squilla.calibration.views import SubImages, evened, inner, sub_images
 from squilla.calibration.wear import (
@@ -37,6 +37,9 @@ _DRIFT = 0.5
 
 _CLEAR = 0.5
 """Mean correlation of the sub-images' edges above which shifts of single units are believed."""
+
+_FLAT = 1e-3
+"""What a plane's disparity may differ by from a map, at the outermost unit, px: it was rounded."""
 
 _TEXTURED = 0.1
 """Mean correlation of the sub-images' edges below which they agree by chance."""
@@ -394,16 +397,16 @@ def align(
     By `resample.sinc_kernel`, the only interpolation between the sensor and the measurement.
     """
     everywhere = np.broadcast_to(np.asarray(disparity, np.float32), lattice.field)
+    place = lattice.places(views.margin + views.offset)
+    image, bad = views.image.numpy(), views.bad.numpy()
     y = torch.empty(*lattice.field, len(lattice.centre))
     valid = torch.empty(y.shape, dtype=torch.bool)
-    resample(
-        views.image.numpy()[None],
-        views.bad.numpy(),
-        lattice.places(views.margin + views.offset),
-        lattice.baseline,
-        everywhere,
-        SINC,
-        y.numpy().transpose(2, 0, 1)[None],
-        valid.numpy().transpose(2, 0, 1),
-    )
+    into = y.numpy().transpose(2, 0, 1), valid.numpy().transpose(2, 0, 1)
+    plane = fit_plane(everywhere)
+    if np.abs(everywhere - plane_map(plane, lattice)).max() * np.abs(lattice.baseline).max() < _FLAT:
+        whole = place.copy()
+        whole[..., :3] += lattice.baseline[..., None] * plane
+        if resample_smoothly(image, bad, whole, *into):
+            return y, valid
+    resample(image[None], bad, place, lattice.baseline, everywhere, SINC, into[0][None], into[1])
     return y, valid

@@ -168,9 +168,8 @@ def find_plane(
 
 def fit_plane(disparity: np.ndarray) -> np.ndarray:
     """Return the plane that fits a disparity map best, (3,) as in `Placement`."""
-    few = (slice(None, None, 4), slice(None, None, 4))
-    terms = monomials(*disparity.shape)[:3, *few].reshape(3, -1)
-    return np.linalg.lstsq(terms.T, disparity[few].ravel(), rcond=None)[0]
+    terms = _grid(disparity.shape, 1)[1][:3].reshape(3, -1)  # at right angles to each other
+    return terms @ disparity.ravel() / np.square(terms).sum(1)
 
 
 def plane_map(plane: np.ndarray, lattice: Lattice, step: int = 1) -> np.ndarray:

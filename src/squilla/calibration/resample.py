@@ -45,6 +45,13 @@ CUBIC = np.array(  # through four points; exact for cubics
 """Lagrange's cubic of four points, for what is smooth already; written like `SINC`."""
 
 
+_BAND = 32
+"""Rows of the field that are worked on together: what lies between two steps stays in the cache."""
+
+_EXACT = 1e-4
+"""What places may be wrong by, px."""
+
+
 def resample(
     images: np.ndarray,
     bad: np.ndarray,
@@ -86,14 +93,92 @@ def resample(
     )
 
 
+def resample_smoothly(
+    images: np.ndarray, bad: np.ndarray, place: np.ndarray, values: np.ndarray, valid: np.ndarray
+) -> bool:
+    """Do what `resample` does with `SINC`, at places that polynomials tell, in half the time.
+
+    Pictures are shifted along their rows first, then along their columns. What a point is shifted
+    by along its row depends on the row it is seen in, and so needs a polynomial of that row.
+
+    Parameters
+    ----------
+    images, bad, values, valid
+        See `resample`; `images` (M, rows, columns) and `values` (M, H, W).
+    place : array, (M, 2, 10)
+        px; disparity and all.
+
+    Returns
+    -------
+    bool
+        Whether such polynomials exist, to 1e-4 px; nothing is filled in otherwise.
+    """
+    units, height, width = valid.shape
+    y, x = np.meshgrid(np.linspace(-1.1, 1.1, 9), np.linspace(-1, 1, 9), indexing="ij")
+    down, right = np.einsum("mcp,pyx->cmyx", place, _powers(y, x)).reshape(2, units, -1)
+    seen = y.ravel() + (down - place[:, :1, 0]) * 2 / max(height - 1, 1)
+    terms = np.moveaxis(_powers(seen, x.ravel()), 0, -1)
+    sheared = np.linalg.solve(terms.mT @ terms, terms.mT @ right[..., None])
+    if np.abs((terms @ sheared)[..., 0] - right).max() > _EXACT:
+        return False
+    reach = np.stack([np.floor(down.min(1)), np.floor(down.max(1))], -1).astype(np.int32)
+    told = (each.astype(np.float32) for each in (place, sheared[..., 0]))
+    _resample_smoothly(images, bad, *told, reach, values, valid)
+    return True
+
+
+def _powers(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return np.stack([y ** (a - b) * x**b for a in range(4) for b in range(a + 1)])
+
+
 def monomials(height: int, width: int) -> np.ndarray:
     """Return 1, y, x, y^2, y x, x^2, y^3, y^2 x, y x^2, x^3 over a field, (10, H, W).
 
     y and x run from -1 to 1 from the first pixel's middle to the last's.
     """
-    y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)[None, :]
-    powers = [(a - b, b) for a in range(4) for b in range(a + 1)]
-    return np.stack([y**i * x**j for i, j in powers])
+    return _powers(np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width))
+
+
+@numba.njit(cache=True, fastmath=True)
+def _places(place, y, out):
+    """Fill in the polynomial of the position along the row at y, gathered by powers of x."""
+    a = place[0] + y * (place[1] + y * (place[3] + y * place[6]))
+    b, c = place[2] + y * (place[4] + y * place[7]), place[5] + y * place[8]
+    step = np.float32(2 / max(len(out) - 1, 1))
+    for column in range(len(out)):
+        x = column * step - np.float32(1)
+        out[column] = a + x * (b + x * (c + x * place[9]))
+
+
+@numba.njit(cache=True, fastmath=True)
+def _split(place, whole, fraction):
+    """Fill in the whole part of places, and the rest - 1/2."""
+    for n in range(len(place)):
+        floor = np.floor(place[n])
+        whole[n], fraction[n] = np.int32(floor), place[n] - floor - np.float32(0.5)
+
+
+@numba.njit(cache=True)
+def _run(whole, first):
+    """Return where the run of equal numbers that begins at `first` ends."""
+    rest, other = whole[first:], False
+    for n in range(len(rest)):  # most often all are equal, which a vector loop tells at once
+        other |= rest[n] != rest[0]
+    if not other:
+        return len(whole)
+    last = first + 1
+    while last < len(whole) and whole[last] == whole[first]:
+        last += 1
+    return last
+
+
+@numba.njit(cache=True)
+def _see(bad, i, j, start, stop, good):
+    """Fill in whether the four pixels around each place of a run are good."""
+    upper, lower = bad[i, start + j : stop + j + 1], bad[i + 1, start + j : stop + j + 1]
+    here = good[start:stop]
+    for k in range(stop - start):
+        here[k] = not (upper[k] | upper[k + 1] | lower[k] | lower[k + 1])
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -119,27 +204,17 @@ def _resample(images, bad, place, baseline, disparity, kernel, values, valid):
         down, right = np.empty(width, np.float32), np.empty(width, np.float32)
         along, across = np.empty((taps, width), np.float32), np.empty((taps, width), np.float32)
         line, good = np.empty((channels, width), np.float32), np.empty(width, np.bool_)
+        v, u = np.empty(width, np.float32), np.empty(width, np.float32)
         y = np.float32(2 * row / max(height - 1, 1) - 1)
         for unit in range(units):
-            # The polynomial of the position, gathered by powers of x.
-            p, q = place[unit, 0], place[unit, 1]
-            p0, q0 = (
-                p[0] + y * (p[1] + y * (p[3] + y * p[6])),
-                q[0] + y * (q[1] + y * (q[3] + y * q[6])),
-            )
-            p1, q1 = p[2] + y * (p[4] + y * p[7]), q[2] + y * (q[4] + y * q[7])
-            p2, q2 = p[5] + y * p[8], q[5] + y * q[8]
-            p3, q3 = p[9], q[9]
-            step = np.float32(2 / max(width - 1, 1))
+            _places(place[unit, 0], y, v)
+            _places(place[unit, 1], y, u)
             for column in range(width):
-                x = column * step - np.float32(1)
-                d = disparity[row, column]
-                v = row + p0 + x * (p1 + x * (p2 + x * p3)) + d * baseline[unit, 0]
-                u = q0 + x * (q1 + x * (q2 + x * q3)) + d * baseline[unit, 1]
-                i, j = np.floor(v), np.floor(u)
-                top[column], left[column] = np.int32(i), np.int32(j)
-                down[column], right[column] = v - i - np.float32(0.5), u - j - np.float32(0.5)
-                good[column] = False
+                v[column] += row + disparity[row, column] * baseline[unit, 0]
+                u[column] += disparity[row, column] * baseline[unit, 1]
+            _split(v, top, down)
+            _split(u, left, right)
+            good[:] = False
             _weigh(kernel, down, along)
             _weigh(kernel, right, across)
             line[:] = 0
@@ -147,9 +222,7 @@ def _resample(images, bad, place, baseline, disparity, kernel, values, valid):
             first = 0
             while first < width:
                 i, j = top[first], left[first]
-                last = first + 1
-                while last < width and top[last] == i and left[last] == j:
-                    last += 1
+                last = min(_run(top, first), _run(left, first))
                 start, stop = max(first, before - j), min(last, columns - taps + before + 1 - j)
                 if before <= i <= rows - taps + before and start < stop:
                     for channel in range(channels):
@@ -157,10 +230,7 @@ def _resample(images, bad, place, baseline, disparity, kernel, values, valid):
                             images[channel, unit], i - before, j - before,
                             along, across, start, stop, line[channel],
                         )  # fmt: skip
-                    upper = bad[unit, i, start + j : stop + j + 1]
-                    lower = bad[unit, i + 1, start + j : stop + j + 1]
-                    for k in range(stop - start):
-                        good[start + k] = not (upper[k] | upper[k + 1] | lower[k] | lower[k + 1])
+                    _see(bad[unit], i, j, start, stop, good)
                 first = last
             for column in range(width):
                 valid[unit, row, column] = good[column]
@@ -204,3 +274,68 @@ def _read(image, top, left, along, across, start, stop, line):
                 + g[n] * (p[n] * v[n + 6] + q[n] * w[n + 6])
                 + h[n] * (p[n] * v[n + 7] + q[n] * w[n + 7])
             )
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _resample_smoothly(images, bad, place, sheared, reach, values, valid):
+    units, rows, columns = images.shape
+    _, height, width = valid.shape
+    scale = np.float32(2 / max(height - 1, 1))
+    for band in numba.prange(-(-height // _BAND)):
+        first, last = band * _BAND, min((band + 1) * _BAND, height)
+        deepest = _BAND + 7 + (reach[:, 1] - reach[:, 0]).max()
+        between = np.empty((units, deepest, width), np.float32)
+        top, left = np.empty(width, np.int32), np.empty(width, np.int32)
+        down, right = np.empty(width, np.float32), np.empty(width, np.float32)
+        line, good = np.empty(width, np.float32), np.empty(width, np.bool_)
+        for unit in range(units):
+            origin = first + reach[unit, 0] - 3
+            for row in range(max(origin, 0), min(last + reach[unit, 1] + 4, rows)):
+                _places(sheared[unit], scale * (row - place[unit, 0, 0]) - np.float32(1), line)
+                _split(line, left, right)
+                source, start = images[unit, row], 0
+                between[unit, row - origin] = 0
+                while start < width:
+                    stop, j = _run(left, start), left[start]
+                    begin, end = max(start, 3 - j), min(stop, columns - 4 - j)
+                    if begin < end:
+                        here = between[unit, row - origin, begin:end]
+                        for k in range(4):
+                            one, other = source[begin + j - 3 + k :], source[begin + j + 4 - k :]
+                            _blend(k, right[begin:end], one, other, here)
+                    start = stop
+        for row in range(first, last):
+            y = scale * row - np.float32(1)
+            for unit in range(units):
+                _places(place[unit, 0], y, line)
+                _split(line, top, down)
+                _places(place[unit, 1], y, line)
+                _split(line, left, right)
+                line[:], good[:] = 0, False
+                start = 0
+                while start < width:
+                    stop, i, j = min(_run(top, start), _run(left, start)), top[start], left[start]
+                    begin, end = max(start, 3 - j), min(stop, columns - 4 - j)
+                    k = i - reach[unit, 0] + row - first
+                    if 3 <= row + i < rows - 4 and 0 <= k <= deepest - 8 and begin < end:
+                        for tap in range(4):
+                            one = between[unit, k + tap, begin:end]
+                            other = between[unit, k + 7 - tap, begin:end]
+                            _blend(tap, down[begin:end], one, other, line[begin:end])
+                        _see(bad[unit], row + i, j, begin, end, good)
+                    start = stop
+                for column in range(width):
+                    values[unit, row, column] = line[column]
+                    valid[unit, row, column] = good[column]
+
+
+@numba.njit(cache=True, fastmath=True)
+def _blend(tap, fraction, one, other, out):
+    """Add two lines to one, weighted by a tap of the windowed sinc and the one that mirrors it."""
+    a, b, c = SINC[tap, 0], SINC[tap, 1], SINC[tap, 2]
+    d, e, f = SINC[tap, 3], SINC[tap, 4], SINC[tap, 5]
+    for n in range(len(out)):
+        t = fraction[n]
+        s = t * t
+        even, odd = a + s * (c + s * e), t * (b + s * (d + s * f))
+        out[n] += (even + odd) * one[n] + (even - odd) * other[n]
