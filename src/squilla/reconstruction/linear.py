@@ -12,7 +12,7 @@ from squilla.calibration.agreement import model_error
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.priors import second_moment
-from squilla.reconstruction.reconstructor import Reconstructor
+from squilla.reconstruction.reconstructor import Reconstructor, Scale
 from squilla.threads import single_threaded_products
 
 SNR = 20.0
@@ -45,7 +45,7 @@ class Ridge(Reconstructor):
     """
 
     name = "ridge"
-    piece = 8192
+    piece = 1 << 16
     basis: Tensor
     power: Tensor
     gain: Tensor
@@ -75,13 +75,7 @@ class Ridge(Reconstructor):
         weights = self.calibration.angle_weights(angle)
         lower = (weights > 0).to(torch.uint8).argmax(-1).clamp_max(weights.shape[-1] - 2)
         x = y.new_empty(len(y), self.gain.shape[-1])
-        # A pixel lies between two angles: one product for both, side by side.
-        basis = torch.cat([self.basis[:-2], self.basis[1:-1]], -1)
-        gain = torch.cat([self.gain[:-2], self.gain[1:-1]], -2)
-        if y.device.type == "cpu":
-            told = (y, noise[:, 0], weights, lower, basis, self.power, gain, x)
-            _between_angles(*(each.numpy() for each in told))
-            return x
+        basis, gain = self._pairs()
         for low in range(weights.shape[-1] - 1):
             some = (lower == low).nonzero()[:, 0]
             pair = slice(low, low + 2)
@@ -91,37 +85,69 @@ class Ridge(Reconstructor):
             x[some] = seen.flatten(1) @ gain[low]
         return x
 
+    def _pairs(self) -> tuple[Tensor, Tensor]:
+        """Return basis and gain of neighbouring angles side by side: one product serves both."""
+        basis = torch.cat([self.basis[:-2], self.basis[1:-1]], -1)
+        return basis, torch.cat([self.gain[:-2], self.gain[1:-1]], -2)
 
-@single_threaded_products()
-def _between_angles(y, noise, weights, lower, basis, power, gain, x) -> None:
-    order = np.argsort(lower, kind="stable")
-    first = np.searchsorted(lower[order], np.arange(len(basis) + 1))
-    _between(y, noise, weights, order, first, basis, power, gain, x)
+    def _piece(self, y: Tensor, angle: Tensor | None, snr: Tensor | None, scale: Scale) -> Tensor:
+        if angle is None or y.device.type != "cpu":
+            return super()._piece(y, angle, snr, scale)
+        node = np.square(self.calibration.angle).astype(np.float32)
+        x = torch.empty(len(y), self.gain.shape[-1])
+        noise = _noise_to_signal(snr, len(y), y.device)
+        told = (y, angle.square(), noise, torch.from_numpy(node), self.power, *self._pairs(), x)
+        with single_threaded_products():
+            _estimate(*(each.detach().numpy() for each in told))
+        return x
+
+
+@numba.njit(cache=True, nogil=True)
+def _estimate(y, square, noise, node, power, basis, gain, x):
+    """Do what `Ridge.estimate` says for pixels as they are: it is linear, and needs no scale."""
+    zone, count = np.zeros(len(y), np.uint8), np.zeros(len(basis) + 1, np.int64)
+    for n in range(len(y)):
+        for low in range(1, len(basis)):
+            zone[n] += square[n] > node[low]
+        count[zone[n] + 1] += 1
+    first = np.cumsum(count)
+    order, place = np.empty(len(y), np.int64), first.copy()
+    for n in range(len(y)):
+        order[place[zone[n]]] = n
+        place[zone[n]] += 1
+    for low in range(len(basis)):
+        for start in range(first[low], first[low + 1], _FEW):
+            some = order[start : min(start + _FEW, first[low + 1])]
+            ends, levels = node[low : low + 2], power[low : low + 2]
+            _between(y, square, noise, some, ends, levels, basis[low], gain[low], x)
+    for n in range(len(y)):
+        lit, finite = False, True
+        for unit in range(y.shape[1]):
+            lit |= y[n, unit] > 0
+            finite &= y[n, unit] * 0 == 0
+        if not (lit and finite):
+            x[n] = 0 if finite else np.nan
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _between(y, noise, weights, order, first, basis, power, gain, x):
-    """Do for all pixels, zone by zone, what `Ridge.estimate` says of them; a few at a time."""
-    units = y.shape[1]
-    seen, score = np.empty((_FEW, units), np.float32), np.empty((_FEW, 2 * units), np.float32)
-    found = np.empty((_FEW, x.shape[1]), np.float32)
-    for low in range(len(basis)):
-        level = power[low].mean(), power[low + 1].mean()
-        for start in range(first[low], first[low + 1], _FEW):
-            some = order[start : min(start + _FEW, first[low + 1])]
-            count = len(some)
-            for n in range(count):
-                seen[n] = y[some[n]]
-            np.dot(seen[:count], basis[low], score[:count])
-            for n in range(count):
-                for side in range(2):
-                    weight = weights[some[n], low + side]
-                    noisy = noise[some[n]] * level[side]
-                    for i in range(units):
-                        score[n, side * units + i] *= weight / (power[low + side, i] + noisy)
-            np.dot(score[:count], gain[low], found[:count])
-            for n in range(count):
-                x[some[n]] = found[n]
+def _between(y, square, noise, some, node, power, basis, gain, x):
+    """Estimate the spectra of a few pixels that lie between two angles."""
+    seen = np.empty((len(some), y.shape[1]), np.float32)
+    for n in range(len(some)):
+        seen[n] = y[some[n]]
+    score = np.dot(seen, basis).reshape(len(some), 2, -1)
+    for n in range(len(some)):
+        share = (square[some[n]] - node[0]) / (node[1] - node[0])
+        share = min(max(share, np.float32(0)), np.float32(1))
+        for side in range(2):
+            weight = share if side else 1 - share
+            noisy = noise[some[n]] * power[side].mean()
+            for i in range(y.shape[1]):
+                score[n, side, i] *= weight / (power[side, i] + noisy)
+    found = np.dot(score.reshape(len(some), -1), gain)
+    for n in range(len(some)):
+        for band in range(x.shape[1]):
+            x[some[n], band] = max(found[n, band], np.float32(0))
 
 
 def levelling(calibration: Calibration) -> Tensor:
@@ -190,7 +216,8 @@ def complete(
     enough = count >= (y.shape[-1] + 1) // 2
     partial = enough & (count < y.shape[-1])
     filled = y.clone()
-    filled[~enough] = torch.nan
+    if not enough.all():
+        filled[~enough] = torch.nan
     if not partial.any():
         return filled
     if angle is None:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -118,12 +119,12 @@ class Reconstructor(nn.Module):
         # A GPU has to be filled; threads of an engine and of PyTorch should not take short turns.
         alone = y.device.type == "cpu" and self._network is None
         piece = self.piece * (1 if alone else 32)
-        parts = [
-            self._piece(y[some], None if angle is None else angle.reshape(-1)[some],
-                        None if snr is None else snr.reshape(-1)[some], scale)
-            for some in torch.arange(len(y), device=y.device).split(piece)
-        ]  # fmt: skip
-        return torch.cat(parts).reshape(*pixels, len(self.wavelength))
+        told = [
+            repeat(None) if each is None else each.reshape(-1).split(piece) for each in (angle, snr)
+        ]
+        parts = [self._piece(*each, scale) for each in zip(y.split(piece), *told, strict=False)]
+        x = torch.cat(parts) if len(parts) > 1 else parts[0]
+        return x.reshape(*pixels, len(self.wavelength))
 
     def _piece(self, y: Tensor, angle: Tensor | None, snr: Tensor | None, scale: Scale) -> Tensor:
         finite = y.sum(-1, keepdim=True).isfinite()
