@@ -135,13 +135,12 @@ def _gradient(images, bad, step, bell, slope, values, wrong):
         if middle < reach or middle >= rows - reach:
             continue
         smooth, steep = bell[reach] * images[unit, middle], np.zeros(columns, np.float32)
-        for k in range(1, reach, 2):  # rows above and below, two of each at a time
-            a, b = images[unit, middle - k], images[unit, middle + k]
-            c, d = images[unit, middle - k - 1], images[unit, middle + k + 1]
-            p, q, r, t = bell[reach + k], bell[reach + k + 1], slope[reach + k], slope[reach + k + 1]
+        for k in range(1, reach + 1):
+            above, below = images[unit, middle - k], images[unit, middle + k]
+            a, b = bell[reach + k], slope[reach + k]
             for column in range(columns):
-                smooth[column] += p * (a[column] + b[column]) + q * (c[column] + d[column])
-                steep[column] += r * (b[column] - a[column]) + t * (d[column] - c[column])
+                smooth[column] += a * (above[column] + below[column])
+                steep[column] += b * (below[column] - above[column])
         spoilt = np.zeros(columns, np.uint8)
         for row_of_bad in range(middle - reach, middle + reach + 1):
             flags = bad[unit, row_of_bad]

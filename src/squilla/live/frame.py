@@ -11,6 +11,7 @@ from xarray import DataArray
 
 from squilla.calibration.alignment import Measurement
 from squilla.live.answer import Answers
+from squilla.reconstruction.linear import counted
 from squilla.reconstruction.partial import Reconstruction
 from squilla.reconstruction.reconstructor import Reconstructor
 
@@ -43,8 +44,9 @@ class LiveFrame(Answers):
         turn: AbstractContextManager,
         before: "LiveFrame | None" = None,
     ):
-        valid = DataArray(measurement.valid.all(-1).numpy(), dims=("y", "x"))
-        rows, columns, _ = measurement.y.shape
+        rows, columns, filters = measurement.y.shape
+        seen = counted(measurement.y, measurement.valid) == filters
+        valid = DataArray(seen.numpy(), dims=("y", "x"))
         super().__init__("live", (rows, columns), np.asarray(model.wavelength), {"valid": valid})
         self.number, self._told, self._turn = number, told, turn
         self._model, self._measurement = model, measurement

@@ -70,7 +70,7 @@ class PointwiseReconstruction(Reconstruction):
         some = None if self._cube is not None else self._model.only(self._checked(numbers))
         if some is None:
             return super().bands(numbers)
-        return some.reconstruct(self._measurement).values
+        return some.spectra_of(self._measurement)
 
     def spectra(self, rows: ArrayLike, columns: ArrayLike) -> np.ndarray:
         if self._cube is not None:
@@ -84,7 +84,7 @@ class PointwiseReconstruction(Reconstruction):
             name: None if part is None else torch.as_tensor(part)[places][None]
             for name, part in parts.items()
         }
-        return self._model.reconstruct(replace(self._measurement, depth=None, **few)).values[0]
+        return self._model.spectra_of(replace(self._measurement, depth=None, **few))[0]
 
 
 class CodedReconstruction(Reconstruction):

@@ -251,6 +251,10 @@ class Reconstructor(nn.Module):
             Photon radiance in the unit that the sensitivity implies, with the wavelengths (nm) as
             coordinate and the origin of the result in `attrs`.
         """
+        return self.labelled(self.spectra_of(measurement, scale), measurement, scale)
+
+    def spectra_of(self, measurement: Measurement, scale: Scale = "consistent") -> np.ndarray:
+        """Return the numbers of `reconstruct` alone, (y, x, K)."""
         from squilla.reconstruction.linear import complete
 
         check_measurement(measurement)
@@ -259,8 +263,7 @@ class Reconstructor(nn.Module):
         y = complete(y, measurement.valid, self.calibration, angle, snr)
         device = next(iter([*self.parameters(), *self.buffers()]), y).device
         with torch.inference_mode():
-            cube = self(y.to(device), angle, snr, scale)
-        return self.labelled(cube.cpu().numpy(), measurement, scale)
+            return self(y.to(device), angle, snr, scale).cpu().numpy()
 
     def reconstruct_interval(self, measurement: Measurement) -> "tuple[DataArray, DataArray]":
         """Return the cube, and half the width of the interval that holds nine in ten of its values.
