@@ -241,13 +241,15 @@ def compare(
 
 def _fill_in(values: np.ndarray, seen: np.ndarray) -> None:
     """Fill in what units do not see, (M, P), by the mean of the others: (M, 2 P), real first."""
-    if seen.all():
+    some = np.flatnonzero(~seen.all(0))
+    if not len(some):
         return
-    parts = values.reshape(len(values), 2, -1)
-    parts *= seen[:, None]
-    mean = parts.sum(0) / (seen.sum(0) + 1e-9)
-    share = np.einsum("mcp,cp->m", parts, mean) / (seen @ np.square(mean).sum(0) + 1e-9)
-    parts += np.where(seen[:, None], 0, share[:, None, None] * mean).astype(np.float32)
+    parts, there = values.reshape(len(values), 2, -1), seen[:, None, some]
+    parts[..., some] *= there
+    mean = parts.sum(0) / (seen.sum(0) + 1e-9).astype(np.float32)
+    share = _product(parts.reshape(len(parts), -1), mean.reshape(1, -1))[:, 0]
+    share /= seen.astype(np.float32) @ np.square(mean).sum(0) + np.float32(1e-9)
+    parts[..., some] += np.where(there, 0, share[:, None, None] * mean[:, some])
 
 
 def _products(values: np.ndarray) -> list[np.ndarray]:
@@ -475,14 +477,18 @@ def _search(edges: Edges, lattice: Lattice, first: np.ndarray, span: tuple[float
     spectra = whole[:, rows[:, None], columns]
     angle_y = 2j * np.pi / edges.step * torch.fft.fftfreq(whole.shape[1])[rows]
     angle_x = 2j * np.pi / edges.step * torch.fft.fftfreq(whole.shape[2])[columns]
+
+    def phase(shift: np.ndarray) -> torch.Tensor:
+        y, x = torch.from_numpy(shift).float().split(1, dim=1)
+        return torch.exp(y * angle_y)[:, :, None] * torch.exp(x * angle_x)[:, None]
+
     # The outermost unit moves by 2 px from one to the next.
     candidates = np.arange(span[0] * reach - 2, span[1] * reach + 3, 2) / reach
-    total = []
-    for candidate in candidates:
-        shift = torch.from_numpy(first + candidate * lattice.baseline).float()
-        along, across = torch.exp(shift[:, :1] * angle_y), torch.exp(shift[:, 1:] * angle_x)
-        together = (spectra * along[:, :, None] * across[:, None]).sum(0)
-        total.append(float(together.abs().square().sum()))
+    spectra = spectra * phase(first + candidates[0] * lattice.baseline)
+    step, total = phase(2 / reach * lattice.baseline), []
+    for _ in candidates:
+        total.append(float(spectra.sum(0).abs().square().sum()))
+        spectra *= step
     return float(candidates[int(np.argmax(total))])
 
 
