@@ -42,7 +42,8 @@ def read(plane, bend):
 
 
 @pytest.mark.parametrize(
-    "plane, bend", [((2, 0, 0), 0), ((1, 0.02, -0.1), 0), ((6, 0.2, -0.3), 0), ((2, 0.02, 0), 0.02)]
+    ("plane", "bend"),
+    [((2, 0, 0), 0), ((1, 0.02, -0.1), 0), ((6, 0.2, -0.3), 0), ((2, 0.02, 0), 0.02)],
 )
 def test_two_steps_are_as_true_as_one(plane, bend):
     once, twice, truth, seen = read(plane, bend)
@@ -63,4 +64,5 @@ def test_what_no_polynomial_tells_is_left_alone():
     image = np.ones((1, 100, 110), np.float32)
     values, seen = np.full((1, *FIELD), -1, np.float32), np.zeros((1, *FIELD), bool)
     assert not resample_smoothly(image, image == 0, place, values, seen)
-    assert (values == -1).all() and not seen.any()
+    assert (values == -1).all()
+    assert not seen.any()

@@ -402,8 +402,8 @@ def align(
     y = torch.empty(*lattice.field, len(lattice.centre))
     valid = torch.empty(y.shape, dtype=torch.bool)
     into = y.numpy().transpose(2, 0, 1), valid.numpy().transpose(2, 0, 1)
-    plane = fit_plane(everywhere)
-    if np.abs(everywhere - plane_map(plane, lattice)).max() * np.abs(lattice.baseline).max() < _FLAT:
+    plane, reach = fit_plane(everywhere), np.abs(lattice.baseline).max()
+    if reach * np.abs(everywhere - plane_map(plane, lattice)).max() < _FLAT:
         whole = place.copy()
         whole[..., :3] += lattice.baseline[..., None] * plane
         if resample_smoothly(image, bad, whole, *into):

@@ -113,7 +113,7 @@ def resample_smoothly(
     bool
         Whether such polynomials exist, to 1e-4 px; nothing is filled in otherwise.
     """
-    units, height, width = valid.shape
+    units, height, _ = valid.shape
     y, x = np.meshgrid(np.linspace(-1.1, 1.1, 9), np.linspace(-1, 1, 9), indexing="ij")
     down, right = np.einsum("mcp,pyx->cmyx", place, _powers(y, x)).reshape(2, units, -1)
     seen = y.ravel() + (down - place[:, :1, 0]) * 2 / max(height - 1, 1)
@@ -122,8 +122,8 @@ def resample_smoothly(
     if np.abs((terms @ sheared)[..., 0] - right).max() > _EXACT:
         return False
     reach = np.stack([np.floor(down.min(1)), np.floor(down.max(1))], -1).astype(np.int32)
-    told = (each.astype(np.float32) for each in (place, sheared[..., 0]))
-    _resample_smoothly(images, bad, *told, reach, values, valid)
+    place, sheared = place.astype(np.float32), sheared[..., 0].astype(np.float32)
+    _resample_smoothly(images, bad, place, sheared, reach, values, valid)
     return True
 
 

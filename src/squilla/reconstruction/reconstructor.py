@@ -122,7 +122,8 @@ class Reconstructor(nn.Module):
         told = [
             repeat(None) if each is None else each.reshape(-1).split(piece) for each in (angle, snr)
         ]
-        parts = [self._piece(*each, scale) for each in zip(y.split(piece), *told, strict=False)]
+        each = zip(y.split(piece), *told, strict=False)
+        parts = [self._piece(some, place, ratio, scale) for some, place, ratio in each]
         x = torch.cat(parts) if len(parts) > 1 else parts[0]
         return x.reshape(*pixels, len(self.wavelength))
 
