@@ -394,7 +394,8 @@ def align(
 
     Notes
     -----
-    By `resample.sinc_kernel`, the only interpolation between the sensor and the measurement.
+    By `resample.sinc_kernel`, the only interpolation between the sensor and the measurement; along
+    rows and columns one after the other where the disparity is that of a plane.
     """
     everywhere = np.broadcast_to(np.asarray(disparity, np.float32), lattice.field)
     place = lattice.places(views.margin + views.offset)

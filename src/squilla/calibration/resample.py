@@ -121,7 +121,8 @@ def resample_smoothly(
     sheared = np.linalg.solve(terms.mT @ terms, terms.mT @ right[..., None])
     if np.abs((terms @ sheared)[..., 0] - right).max() > _EXACT:
         return False
-    reach = np.stack([np.floor(down.min(1)), np.floor(down.max(1))], -1).astype(np.int32)
+    reach = np.stack([down.min(1) - 0.25, down.max(1) + 0.25], -1)  # more than between the nodes
+    reach = np.floor(reach).astype(np.int32)
     place, sheared = place.astype(np.float32), sheared[..., 0].astype(np.float32)
     _resample_smoothly(images, bad, place, sheared, reach, values, valid)
     return True
