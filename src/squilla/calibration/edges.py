@@ -142,8 +142,8 @@ def _gradient(images, bad, step, bell, slope, values, wrong):
                 smooth[column] += a * (above[column] + below[column])
                 steep[column] += b * (below[column] - above[column])
         spoilt = np.zeros(columns, np.uint8)
-        for row_of_bad in range(middle - reach, middle + reach + 1):
-            flags = bad[unit, row_of_bad]
+        for near in range(middle - reach, middle + reach + 1):
+            flags = bad[unit, near]
             for column in range(columns):
                 spoilt[column] += flags[column]
         # Every step-th sample together, so that the compiler makes vector loops of what follows.
