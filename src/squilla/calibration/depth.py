@@ -16,8 +16,9 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from torch import Tensor
 
 from squilla.calibration.calibration import Lattice
+from squilla.calibration.plain import fill_plain
 from squilla.calibration.resample import CUBIC, SINC, resample
-from squilla.calibration.surfaces import is_relief, lowest, settled, smoothed, unhidden
+from squilla.calibration.surfaces import is_relief, lowest, settled, smoothed, trusted, unhidden
 
 if TYPE_CHECKING:
     from xarray import DataArray
@@ -143,9 +144,12 @@ def find_depth(
     )  # fmt: skip
     evidence -= 2  # what noise alone gives: two components of variance one
     rough = lowest(smoothed(cost, evidence), planes)
-    if not is_relief(cost, planes, rough, usual):
-        rough = usual.astype(np.float32)
-    disparity = settled(rough, evidence, _picture(views, lattice, level, rough), usual)
+    believed, level_share = trusted(rough, evidence)
+    if is_relief(cost, planes, rough, usual):
+        filled, believed = fill_plain(rough, believed, evidence, cost, planes, usual)
+        disparity = settled(filled, believed, _picture(views, lattice, level, rough))
+    else:
+        rough = disparity = usual.astype(np.float32)
     # Cramer-Rao: a unit tells of a shift by its slope across the noise, of disparity by its
     # baseline against the mean of all.
     share = weight**2 / (weight**2).sum()
