@@ -7,8 +7,10 @@ may, for faint texture adds up. Where it does not, the area lies behind the edge
 import numpy as np
 from scipy.ndimage import binary_dilation, find_objects, gaussian_filter, label
 
-_WEAK, _ENOUGH = 10.0, 60.0
-"""Evidence around a point below which it is plain, and beyond which more does not tell more."""
+from squilla.calibration.surfaces import ENOUGH
+
+_WEAK = 10.0
+"""Mean evidence around a point below which it is plain."""
 
 _FEW = 40
 """Points below which an area is left to its neighbours."""
@@ -17,7 +19,7 @@ _RIM, _STEADY = 6, 0.3
 """How far around an area its bounds lie, px, and the belief that such a point needs."""
 
 _CLEAR, _SURE = 0.002, 0.19
-"""Dip of the mean cost that is no chance: of a large area, and of one point's worth of noise."""
+"""Dip of the mean cost that is no chance: of any area, and of one of a single point."""
 
 _ASIDE = 0.6
 """Disparity beside the best by which a true one stands out, px per pitch: the width of edges."""
@@ -25,8 +27,8 @@ _ASIDE = 0.6
 _NEARER = 0.1
 """Share of an area's bounds that may lie behind it."""
 
-_FLAT = 0.02
-"""Price of a slant of the bounding plane against its misfit."""
+_FLAT = 0.3
+"""Price of a slant, squared, for a step from one bound to the other may look like one."""
 
 
 def fill_plain(
@@ -55,7 +57,7 @@ def fill_plain(
     rough, believed : array, (H, W)
         Filled; areas that are too small to tell anything are not believed.
     """
-    weak = gaussian_filter(np.clip(evidence, 0, _ENOUGH), 2.0) < _WEAK
+    weak = gaussian_filter(np.clip(evidence, 0, ENOUGH), 2.0) < _WEAK
     filled, trust = rough.copy(), np.where(weak, 0, believed).astype(np.float32)
     areas, _ = label(weak)
     for number, place in enumerate(find_objects(areas), 1):
@@ -88,6 +90,8 @@ def told_plane(cost: np.ndarray, ramps: np.ndarray, planes: np.ndarray) -> np.nd
     """
     step, count = planes[1] - planes[0], len(planes)
     aside = max(1, round(_ASIDE / step))
+    if count <= 2 * aside:  # all planes are within the width of an edge
+        return None
     mean = cost.mean(0)
     best = aside + int(mean[aside:-aside].argmin())
     dip = (mean[best - aside] + mean[best + aside]) / 2 - mean[best]
@@ -129,13 +133,13 @@ def bounding_plane(bounds: np.ndarray, ramps: np.ndarray) -> np.ndarray:
     Notes
     -----
     Quantile regression by weighted least squares in turns: R. Koenker and G. Bassett,
-    Econometrica 46 (1978). A slant that the bounds do not ask for is kept small.
+    Econometrica 46 (1978); with a price on slants.
     """
-    flat = _FLAT * len(bounds) * np.diag([0.0, 1, 1])
+    flat = 2 * _FLAT * len(bounds) * np.diag([0.0, 1, 1])
     weight, plane = np.ones(len(bounds)), np.zeros(3)
     for _ in range(20):
         heavy = weight * ramps
-        plane = np.linalg.solve(heavy @ ramps.T + weight.mean() * flat, heavy @ bounds)
+        plane = np.linalg.solve(heavy @ ramps.T + flat, heavy @ bounds)
         above = bounds - plane @ ramps
         weight = np.where(above > 0, _NEARER, 1 - _NEARER) / np.maximum(np.abs(above), 0.02)
     return plane

@@ -14,16 +14,16 @@ _SLANT, _JUMP = 0.02, 1.0
 _CLEAR = 0.055
 """Share of the energy that a neighbourhood has to explain better to contradict a plane."""
 
-_REACH, _CONTRAST = 10.0, 0.03
+_REACH, _CONTRAST = 7.0, 0.035
 """How far the settling reaches, px, and the contrast in the picture that stops it."""
 
 _WRONG = 0.12
 """Disparity beyond which neighbours do not mean the same surface, px per pitch."""
 
-_ENOUGH = 60.0
-"""Evidence that is plenty."""
+ENOUGH = 60.0
+"""Evidence beyond which a point counts no more."""
 
-_STEEP = 0.025
+_STEEP = 0.035
 """Slope of a map at which its points count a quarter, px per pitch and px."""
 
 
@@ -107,15 +107,14 @@ def is_relief(cost: np.ndarray, planes: np.ndarray, rough: np.ndarray, usual: np
 # --- settling ---------------------------------------------------------------------------------
 
 
-def trusted(rough: np.ndarray, evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how much every point counts, 0..1, and which share of that its slope leaves, (H, W).
+def trusted(rough: np.ndarray, evidence: np.ndarray) -> np.ndarray:
+    """Return how much every point of a map counts, (H, W), 0..1.
 
     Surfaces are seldom steep. Around an edge, which some units see move with the near side and
     some with the far one, a map climbs from one surface to the other and is true for neither.
     """
     slope = gaussian_gradient_magnitude(rough, 3.0)
-    level = (1 + (slope / _STEEP) ** 2) ** -2
-    return np.clip(evidence / _ENOUGH, 0, 1) * level, level
+    return np.clip(evidence / ENOUGH, 0, 1) / (1 + (slope / _STEEP) ** 2) ** 2
 
 
 def settled(rough: np.ndarray, believed: np.ndarray, picture: np.ndarray) -> np.ndarray:
