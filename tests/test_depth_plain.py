@@ -100,4 +100,5 @@ def test_a_plain_wall_is_as_far_as_its_texture_elsewhere(camera, calibration):
     plain_wall[18:42, 20:42] = False  # the square, and what lenses blur around it
     error = measurement.disparity.numpy() - 0.7 * camera.design.focal / 150.0
     assert np.mean(np.abs(error[plain_wall]) < 0.1) > 0.9
+    assert measurement.depth is not None
     assert measurement.depth.confident.numpy()[plain_wall].mean() < 0.2

@@ -59,7 +59,8 @@ def fill_plain(
     """
     weak = gaussian_filter(np.clip(evidence, 0, ENOUGH), 2.0) < _WEAK
     filled, trust = rough.copy(), np.where(weak, 0, believed).astype(np.float32)
-    areas, _ = label(weak)
+    areas = np.empty(weak.shape, np.int32)
+    label(weak, output=areas)
     for number, place in enumerate(find_objects(areas), 1):
         around = tuple(slice(max(side.start - _RIM, 0), side.stop + _RIM) for side in place)
         inside = areas[around] == number
@@ -67,7 +68,8 @@ def fill_plain(
             continue
         plane = told_plane(cost[around][inside], _ramps(inside, inside), planes)
         if plane is None:
-            rim = binary_dilation(inside, iterations=_RIM) & (trust[around] > _STEADY)
+            near = np.asarray(binary_dilation(inside, iterations=_RIM), bool)
+            rim = near & (trust[around] > _STEADY)
             bounds = rough[around][rim]
             plane = usual[around][inside]
             if len(bounds) > 3:
