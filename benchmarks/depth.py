@@ -298,6 +298,28 @@ def compared(take: Take, snr: float, known: dict) -> dict:
     return rows
 
 
+def where(take: Take, snr: float) -> dict:
+    """Return which parts of a scene are found wrongly, percent of its points."""
+    views, noise = take.views(take.raws(snr)[0])
+    error = np.abs(every_point(take, views, noise)[0] - take.truth)
+    step = ndimage.maximum_filter(take.truth, 3) - ndimage.minimum_filter(take.truth, 3) > 0.12
+    light = take.scene.values.mean(-1) / take.scene.values.mean()
+    texture = ndimage.gaussian_filter(ndimage.gaussian_gradient_magnitude(light, 1.2), 2.0)
+    away = ndimage.distance_transform_edt(~step)
+    parts = {
+        "up to 2 px from a jump": away <= 2,
+        "3 to 6 px from a jump": (away > 2) & (away <= 6),
+        "textured": (away > 6) & (texture > 0.012),
+        "plain, bright": (away > 6) & (texture <= 0.012) & (light > 0.5),
+        "plain, dark": (away > 6) & (texture <= 0.012) & (light <= 0.5),
+    }
+    return {
+        name: {"share": 100 * float(part.mean())}
+        | {f"over_{limit}": 100 * float(np.mean(part & (error > limit))) for limit in (0.1, 0.5)}
+        for name, part in parts.items()
+    }
+
+
 def spectra(take: Take, snr: float) -> dict:
     """Return the mean squared error of whole cubes over the mean square of the truth."""
     raw, plane = take.raws(snr)
@@ -370,18 +392,20 @@ def figure(take: Take, path: Path) -> None:
         inner = slice(take.margin, -take.margin)
         for spot, unit in enumerate((0, 5)):
             picture = views.image[unit, inner, inner].numpy()
-            draw_picture(axes[4 * spot], picture, f"sub-image {unit}, as recorded", vmin=0)
-        part = (slice(60, 140), slice(120, 225))
-        for spot, (name, each) in enumerate({"one shift": one, "every point": every}.items()):
+            draw_picture(axes[4 * spot], picture, f"sub-image {unit}", vmin=0)
+        part = (slice(62, 152), slice(132, 222))
+        for spot, (name, each) in enumerate(
+            {"one shift for all": one, "every point": every}.items()
+        ):
             colours = false_colour(each.y.numpy())
-            draw_picture(axes[1 + spot], colours, f"{name}: units 0, 5, 30")
-            draw_picture(axes[5 + spot], colours[part], "its edges")
+            draw_picture(axes[1 + spot], colours, name)
+            draw_picture(axes[5 + spot], colours[part], f"{name}, enlarged")
         limits = {"vmin": take.depth.min() - 2, "vmax": take.depth.max() + 2, "cmap": "viridis_r"}
         draw_picture(axes[3], take.depth, "true distance", **limits)
         assert every.depth is not None
         found = every.depth.distance.numpy()
         pale = np.where(every.depth.confident.numpy(), 1.0, 0.35)
-        draw_picture(axes[7], found, "found; pale: filled in", alpha=pale, **limits)
+        draw_picture(axes[7], found, "found (pale: not sure)", alpha=pale, **limits)
         draw_colour_bar(sheets, axes[3].images[0], "distance (mm)")
         return sheets
 
@@ -409,7 +433,8 @@ def main() -> None:
 
     def missing(name: str) -> bool:
         rows = cells.get(name, {})
-        whole = bool(rows) and ("squilla" in rows or name.startswith("doll at"))
+        one = name.startswith("doll at") or name.endswith("where")
+        whole = bool(rows) and (one or "squilla" in rows)
         return not whole and name.startswith(given.only)
 
     def cell(name: str, compute: Callable[[], dict]) -> None:
@@ -421,13 +446,14 @@ def main() -> None:
             print(name, json.dumps(cells[name]), flush=True)
 
     for name, (build, how) in scenes.items():
-        wanted = [f"{name}, {snr} dB" for snr in (20, 30)] + [f"{name}, spectra"]
+        wanted = [f"{name}, {part}" for part in ("20 dB", "30 dB", "where", "spectra")]
         if not any(map(missing, wanted)) and not given.figure:
             continue
         take = Take(camera, calibration, *build(wavelength, **how), how["seed"])
         for snr in (20, 30):
             known = cells.get(f"{name}, {snr} dB", {})
             cell(f"{name}, {snr} dB", lambda t=take, s=snr, k=known: compared(t, s, k))
+        cell(f"{name}, where", lambda take=take: where(take, 20.0))
         cell(f"{name}, spectra", lambda take=take: spectra(take, 20.0))
         if given.figure:
             figure(take, given.figure)
@@ -453,7 +479,7 @@ def table(cells: dict) -> None:
                 means = {key: np.mean([each[method][key] for each in some]) for key in keys}
                 print(f"{method:<26}", "  ".join(f"{k} {v:.3g}" for k, v in means.items()))
     for name, each in cells.items():
-        if "spectra" in name or name.startswith(("flat", "doll at")):
+        if name.endswith(("spectra", "where")) or name.startswith(("flat", "doll at")):
             print(f"\n{name}")
             for method, row in each.items():
                 row = row if isinstance(row, dict) else {"": row}
