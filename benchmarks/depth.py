@@ -32,6 +32,7 @@ from squilla.calibration import depth as dense
 from squilla.calibration import surfaces
 from squilla.calibration.alignment import align, measure, place
 from squilla.calibration.calibration import Calibration
+from squilla.calibration.disparity import plane_map
 from squilla.calibration.rehearsal import Rehearsal
 from squilla.calibration.views import SubImages, sub_images, windows
 from squilla.camera.scenes import load_scene
@@ -138,14 +139,15 @@ def _aligned_at(take: Take, pictures: np.ndarray, views: SubImages, disparity: f
     return align(moved, take.lattice, disparity)[0].permute(2, 0, 1).numpy()
 
 
-def one_shift(take: Take, views: SubImages, noise: np.ndarray) -> np.ndarray:
+def one_plane(take: Take, views: SubImages, noise: np.ndarray) -> np.ndarray:
+    """What `measure` does without depth."""
     plane, _, _ = place(views, take.lattice, take.lattice.disparity(NEAREST), noise=noise)
-    return np.full(take.lattice.field, plane[0], np.float32)
+    return plane_map(plane, take.lattice).astype(np.float32)
 
 
 def patch_matching(take: Take, views: SubImages, noise: np.ndarray, side: int = 11) -> np.ndarray:
     """Each unit against the reference by correlation of patches, in two dimensions."""
-    start = float(one_shift(take, views, noise)[0, 0])
+    start = float(np.median(one_plane(take, views, noise)))
     maps = _aligned_at(take, _steepness(views), views, start)
     lattice = take.lattice
 
@@ -189,7 +191,7 @@ def patch_matching(take: Take, views: SubImages, noise: np.ndarray, side: int = 
 
 def optical_flow(take: Take, views: SubImages, noise: np.ndarray) -> np.ndarray:
     """Each unit against the reference by OpenCV's DIS flow, medium preset, on gradients."""
-    start = float(one_shift(take, views, noise)[0, 0])
+    start = float(np.median(one_plane(take, views, noise)))
     maps = np.clip(_aligned_at(take, _steepness(views), views, start) * 70, 0, 255).astype(np.uint8)
     engine = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     found = []
@@ -233,12 +235,12 @@ def stereo_pairs(take: Take, views: SubImages, noise: np.ndarray) -> np.ndarray:
 
 def every_point(take: Take, views: SubImages, noise: np.ndarray):
     """What `measure(..., depth=True)` does: the plane first, then every point."""
-    usual = one_shift(take, views, noise)
+    usual = one_plane(take, views, noise)
     return dense.find_depth(views, take.lattice, noise, take.lattice.disparity(NEAREST), usual)
 
 
 METHODS: dict[str, Callable[[Take, SubImages, np.ndarray], np.ndarray]] = {
-    "one shift per sub-image": one_shift,
+    "one plane": one_plane,
     "2-D patch matching": patch_matching,
     "DIS optical flow": optical_flow,
     "StereoSGBM, ten pairs": stereo_pairs,
@@ -277,7 +279,7 @@ def compared(take: Take, snr: float, known: dict) -> dict:
         start = time.process_time()
         found = method(take, views, noise)
         seconds = time.process_time() - start
-        seen = None if method is one_shift else surfaces.unhidden(found, baseline)
+        seen = None if method is one_plane else surfaces.unhidden(found, baseline)
         error = take.cube_error(found, seen)
         rows[name] = judged(take, found) | {"cube_error": error, "seconds": seconds}
     every_point(take, views, noise)
@@ -325,7 +327,7 @@ def spectra(take: Take, snr: float) -> dict:
     raw, plane = take.raws(snr)
     truth = take.camera.truth(take.scene, depth=take.depth).cube
     measurements = {
-        "one shift per sub-image": measure(raw, take.calibration),
+        "one plane": measure(raw, take.calibration),
         "squilla": measure(raw, take.calibration, nearest=NEAREST, depth=True),
         "perfectly aligned": measure(plane, take.calibration, distance=take.distance),
     }
@@ -343,10 +345,10 @@ def flat(camera: Camera, calibration: Calibration, name: str, distance: float = 
     scene = load_scene(name, camera.design.wavelength, camera.design.field.size)
     take = Take(camera, calibration, scene, np.full(scene.shape[:2], distance), 5)
     views, noise = take.views(take.raws(20.0)[0])
-    once = one_shift(take, views, noise)
+    once = one_plane(take, views, noise)
     found, deviation, seen = every_point(take, views, noise)
     return {
-        "one shift": judged(take, once) | {"cube_error": take.cube_error(once, None)},
+        "one plane": judged(take, once) | {"cube_error": take.cube_error(once, None)},
         "squilla": judged(take, found, deviation <= dense._SURE)
         | {"cube_error": take.cube_error(found, seen)},
     }
@@ -372,7 +374,7 @@ def ranged(camera: Camera, calibration: Calibration, distance: float) -> dict:
 
 
 def figure(take: Take, path: Path) -> None:
-    """Draw sub-images, one shift, every point its own, and the depth."""
+    """Draw sub-images, one plane, every point its own, and the depth."""
     from squilla.evaluation.style import WIDTH, draw_colour_bar, draw_picture, sheet, styled
 
     raw = take.raws(30.0)[0]
@@ -394,9 +396,7 @@ def figure(take: Take, path: Path) -> None:
             picture = views.image[unit, inner, inner].numpy()
             draw_picture(axes[4 * spot], picture, f"sub-image {unit}", vmin=0)
         part = (slice(62, 152), slice(132, 222))
-        for spot, (name, each) in enumerate(
-            {"one shift for all": one, "every point": every}.items()
-        ):
+        for spot, (name, each) in enumerate({"one plane": one, "every point": every}.items()):
             colours = false_colour(each.y.numpy())
             draw_picture(axes[1 + spot], colours, name)
             draw_picture(axes[5 + spot], colours[part], f"{name}, enlarged")
