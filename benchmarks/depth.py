@@ -6,7 +6,8 @@
 Captures solid scenes with the twin of the thesis' camera at 20 and 30 dB, finds their depth and
 judges it by the planted one. Every cell of the tables is written to
 experiments/results/depth.json as soon as it is measured; cells already there are not measured
-again. Times are processor seconds of one thread after a warm-up, for they hold on a busy machine.
+again, nor are other methods where only the row of squilla is missing. Times are processor seconds
+of one thread after a warm-up, for they hold on a busy machine.
 
 cube error: noise-free sub-images, aligned by what was found in the noisy frame, hidden channels
 filled as every reconstructor fills them, against the same picture captured as a plane facing the
@@ -31,6 +32,7 @@ from squilla.calibration import depth as dense
 from squilla.calibration import surfaces
 from squilla.calibration.alignment import align, measure, place
 from squilla.calibration.calibration import Calibration
+from squilla.calibration.disparity import plane_map
 from squilla.calibration.rehearsal import Rehearsal
 from squilla.calibration.views import SubImages, sub_images, windows
 from squilla.camera.scenes import load_scene
@@ -137,14 +139,15 @@ def _aligned_at(take: Take, pictures: np.ndarray, views: SubImages, disparity: f
     return align(moved, take.lattice, disparity)[0].permute(2, 0, 1).numpy()
 
 
-def one_shift(take: Take, views: SubImages, noise: np.ndarray) -> np.ndarray:
+def one_plane(take: Take, views: SubImages, noise: np.ndarray) -> np.ndarray:
+    """What `measure` does without depth."""
     plane, _, _ = place(views, take.lattice, take.lattice.disparity(NEAREST), noise=noise)
-    return np.full(take.lattice.field, plane[0], np.float32)
+    return plane_map(plane, take.lattice).astype(np.float32)
 
 
 def patch_matching(take: Take, views: SubImages, noise: np.ndarray, side: int = 11) -> np.ndarray:
     """Each unit against the reference by correlation of patches, in two dimensions."""
-    start = float(one_shift(take, views, noise)[0, 0])
+    start = float(np.median(one_plane(take, views, noise)))
     maps = _aligned_at(take, _steepness(views), views, start)
     lattice = take.lattice
 
@@ -188,7 +191,7 @@ def patch_matching(take: Take, views: SubImages, noise: np.ndarray, side: int = 
 
 def optical_flow(take: Take, views: SubImages, noise: np.ndarray) -> np.ndarray:
     """Each unit against the reference by OpenCV's DIS flow, medium preset, on gradients."""
-    start = float(one_shift(take, views, noise)[0, 0])
+    start = float(np.median(one_plane(take, views, noise)))
     maps = np.clip(_aligned_at(take, _steepness(views), views, start) * 70, 0, 255).astype(np.uint8)
     engine = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     found = []
@@ -232,12 +235,12 @@ def stereo_pairs(take: Take, views: SubImages, noise: np.ndarray) -> np.ndarray:
 
 def every_point(take: Take, views: SubImages, noise: np.ndarray):
     """What `measure(..., depth=True)` does: the plane first, then every point."""
-    usual = one_shift(take, views, noise)
+    usual = one_plane(take, views, noise)
     return dense.find_depth(views, take.lattice, noise, take.lattice.disparity(NEAREST), usual)
 
 
 METHODS: dict[str, Callable[[Take, SubImages, np.ndarray], np.ndarray]] = {
-    "one shift per sub-image": one_shift,
+    "one plane": one_plane,
     "2-D patch matching": patch_matching,
     "DIS optical flow": optical_flow,
     "StereoSGBM, ten pairs": stereo_pairs,
@@ -264,17 +267,19 @@ def judged(take: Take, disparity: np.ndarray, trusted: np.ndarray | None = None)
     return told
 
 
-def compared(take: Take, snr: float) -> dict:
-    """Return what every method makes of a scene."""
+def compared(take: Take, snr: float, known: dict) -> dict:
+    """Return what every method makes of a scene; what is known of others is not measured again."""
     views, noise = take.views(take.raws(snr)[0])
-    baseline, rows = take.lattice.baseline, {}
+    baseline, rows = take.lattice.baseline, dict(known)
     for name, method in METHODS.items():
+        if name in known:
+            continue
         if method is not patch_matching:  # nothing of it is compiled
             method(take, views, noise)
         start = time.process_time()
         found = method(take, views, noise)
         seconds = time.process_time() - start
-        seen = None if method is one_shift else surfaces.unhidden(found, baseline)
+        seen = None if method is one_plane else surfaces.unhidden(found, baseline)
         error = take.cube_error(found, seen)
         rows[name] = judged(take, found) | {"cube_error": error, "seconds": seconds}
     every_point(take, views, noise)
@@ -295,12 +300,34 @@ def compared(take: Take, snr: float) -> dict:
     return rows
 
 
+def where(take: Take, snr: float) -> dict:
+    """Return which parts of a scene are found wrongly, percent of its points."""
+    views, noise = take.views(take.raws(snr)[0])
+    error = np.abs(every_point(take, views, noise)[0] - take.truth)
+    step = ndimage.maximum_filter(take.truth, 3) - ndimage.minimum_filter(take.truth, 3) > 0.12
+    light = take.scene.values.mean(-1) / take.scene.values.mean()
+    texture = ndimage.gaussian_filter(ndimage.gaussian_gradient_magnitude(light, 1.2), 2.0)
+    away = ndimage.distance_transform_edt(~step)
+    parts = {
+        "up to 2 px from a jump": away <= 2,
+        "3 to 6 px from a jump": (away > 2) & (away <= 6),
+        "textured": (away > 6) & (texture > 0.012),
+        "plain, bright": (away > 6) & (texture <= 0.012) & (light > 0.5),
+        "plain, dark": (away > 6) & (texture <= 0.012) & (light <= 0.5),
+    }
+    return {
+        name: {"share": 100 * float(part.mean())}
+        | {f"over_{limit}": 100 * float(np.mean(part & (error > limit))) for limit in (0.1, 0.5)}
+        for name, part in parts.items()
+    }
+
+
 def spectra(take: Take, snr: float) -> dict:
     """Return the mean squared error of whole cubes over the mean square of the truth."""
     raw, plane = take.raws(snr)
     truth = take.camera.truth(take.scene, depth=take.depth).cube
     measurements = {
-        "one shift per sub-image": measure(raw, take.calibration),
+        "one plane": measure(raw, take.calibration),
         "squilla": measure(raw, take.calibration, nearest=NEAREST, depth=True),
         "perfectly aligned": measure(plane, take.calibration, distance=take.distance),
     }
@@ -318,10 +345,10 @@ def flat(camera: Camera, calibration: Calibration, name: str, distance: float = 
     scene = load_scene(name, camera.design.wavelength, camera.design.field.size)
     take = Take(camera, calibration, scene, np.full(scene.shape[:2], distance), 5)
     views, noise = take.views(take.raws(20.0)[0])
-    once = one_shift(take, views, noise)
+    once = one_plane(take, views, noise)
     found, deviation, seen = every_point(take, views, noise)
     return {
-        "one shift": judged(take, once) | {"cube_error": take.cube_error(once, None)},
+        "one plane": judged(take, once) | {"cube_error": take.cube_error(once, None)},
         "squilla": judged(take, found, deviation <= dense._SURE)
         | {"cube_error": take.cube_error(found, seen)},
     }
@@ -347,7 +374,7 @@ def ranged(camera: Camera, calibration: Calibration, distance: float) -> dict:
 
 
 def figure(take: Take, path: Path) -> None:
-    """Draw sub-images, one shift, every point its own, and the depth."""
+    """Draw sub-images, one plane, every point its own, and the depth."""
     from squilla.evaluation.style import WIDTH, draw_colour_bar, draw_picture, sheet, styled
 
     raw = take.raws(30.0)[0]
@@ -367,18 +394,18 @@ def figure(take: Take, path: Path) -> None:
         inner = slice(take.margin, -take.margin)
         for spot, unit in enumerate((0, 5)):
             picture = views.image[unit, inner, inner].numpy()
-            draw_picture(axes[4 * spot], picture, f"sub-image {unit}, as recorded", vmin=0)
-        part = (slice(60, 140), slice(120, 225))
-        for spot, (name, each) in enumerate({"one shift": one, "every point": every}.items()):
+            draw_picture(axes[4 * spot], picture, f"sub-image {unit}", vmin=0)
+        part = (slice(62, 152), slice(132, 222))
+        for spot, (name, each) in enumerate({"one plane": one, "every point": every}.items()):
             colours = false_colour(each.y.numpy())
-            draw_picture(axes[1 + spot], colours, f"{name}: units 0, 5, 30")
-            draw_picture(axes[5 + spot], colours[part], "its edges")
+            draw_picture(axes[1 + spot], colours, name)
+            draw_picture(axes[5 + spot], colours[part], f"{name}, enlarged")
         limits = {"vmin": take.depth.min() - 2, "vmax": take.depth.max() + 2, "cmap": "viridis_r"}
         draw_picture(axes[3], take.depth, "true distance", **limits)
         assert every.depth is not None
         found = every.depth.distance.numpy()
         pale = np.where(every.depth.confident.numpy(), 1.0, 0.35)
-        draw_picture(axes[7], found, "found; pale: filled in", alpha=pale, **limits)
+        draw_picture(axes[7], found, "found (pale: not sure)", alpha=pale, **limits)
         draw_colour_bar(sheets, axes[3].images[0], "distance (mm)")
         return sheets
 
@@ -404,8 +431,14 @@ def main() -> None:
     cells = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     cells["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
 
+    def missing(name: str) -> bool:
+        rows = cells.get(name, {})
+        one = name.startswith("doll at") or name.endswith("where")
+        whole = bool(rows) and (one or "squilla" in rows)
+        return not whole and name.startswith(given.only)
+
     def cell(name: str, compute: Callable[[], dict]) -> None:
-        if name not in cells and name.startswith(given.only):
+        if missing(name):
             found = compute()
             cells.update(json.loads(RESULTS.read_text()) if RESULTS.exists() else {})
             cells[name] = found
@@ -413,13 +446,14 @@ def main() -> None:
             print(name, json.dumps(cells[name]), flush=True)
 
     for name, (build, how) in scenes.items():
-        wanted = [f"{name}, {snr} dB" for snr in (20, 30)] + [f"{name}, spectra"]
-        missing = [each for each in wanted if each not in cells and each.startswith(given.only)]
-        if not missing and not given.figure:
+        wanted = [f"{name}, {part}" for part in ("20 dB", "30 dB", "where", "spectra")]
+        if not any(map(missing, wanted)) and not given.figure:
             continue
         take = Take(camera, calibration, *build(wavelength, **how), how["seed"])
         for snr in (20, 30):
-            cell(f"{name}, {snr} dB", lambda take=take, snr=snr: compared(take, snr))
+            known = cells.get(f"{name}, {snr} dB", {})
+            cell(f"{name}, {snr} dB", lambda t=take, s=snr, k=known: compared(t, s, k))
+        cell(f"{name}, where", lambda take=take: where(take, 20.0))
         cell(f"{name}, spectra", lambda take=take: spectra(take, 20.0))
         if given.figure:
             figure(take, given.figure)
@@ -445,7 +479,7 @@ def table(cells: dict) -> None:
                 means = {key: np.mean([each[method][key] for each in some]) for key in keys}
                 print(f"{method:<26}", "  ".join(f"{k} {v:.3g}" for k, v in means.items()))
     for name, each in cells.items():
-        if "spectra" in name or name.startswith(("flat", "doll at")):
+        if name.endswith(("spectra", "where")) or name.startswith(("flat", "doll at")):
             print(f"\n{name}")
             for method, row in each.items():
                 row = row if isinstance(row, dict) else {"": row}

@@ -16,8 +16,9 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from torch import Tensor
 
 from squilla.calibration.calibration import Lattice
+from squilla.calibration.plain import fill_plain
 from squilla.calibration.resample import CUBIC, SINC, resample
-from squilla.calibration.surfaces import is_relief, lowest, settled, smoothed, unhidden
+from squilla.calibration.surfaces import is_relief, lowest, settled, smoothed, trusted, unhidden
 
 if TYPE_CHECKING:
     from xarray import DataArray
@@ -108,8 +109,8 @@ def find_depth(
         px per lens pitch.
     deviation : array, (H, W) float32
         Its standard deviation, px per pitch: the Cramer-Rao bound of the texture in the window with
-        what slant and blur add; or, if that is more, what the smoothing moved it by, and beside a
-        jump half of it.
+        what slant and blur add; or, if that is more, what the settling moved it by, and beside a
+        jump 0.7 of it.
     seen : array, (H, W, M) bool
         False where something nearer hides the point from a unit.
 
@@ -125,7 +126,7 @@ def find_depth(
 
     Sources: R. Collins, CVPR 1996, for the sweep; S. B. Kang et al., CVPR 2001, for the halves;
     H. Hirschmueller, PAMI 30 (2008), for the smoothing; D. Min et al., TIP 23 (2014), for the
-    filling.
+    settling.
     """
     image = views.image.numpy()
     count = 1 + max(4, int(np.ceil(nearest * float(np.abs(lattice.baseline).max()) / _STEP)))
@@ -143,16 +144,20 @@ def find_depth(
     )  # fmt: skip
     evidence -= 2  # what noise alone gives: two components of variance one
     rough = lowest(smoothed(cost, evidence), planes)
-    if not is_relief(cost, planes, rough, usual):
-        rough = usual.astype(np.float32)
-    disparity = settled(rough, evidence, _picture(views, lattice, level, rough), usual)
+    if is_relief(cost, planes, rough, usual):
+        believed = trusted(rough, evidence)
+        filled, believed = fill_plain(rough, believed, evidence, cost, planes, usual)
+        disparity = settled(filled, believed, _picture(views, lattice, level, rough))
+    else:
+        rough = disparity = usual.astype(np.float32)
     # Cramer-Rao: a unit tells of a shift by its slope across the noise, of disparity by its
     # baseline against the mean of all.
     share = weight**2 / (weight**2).sum()
     spread = (share @ (lattice.baseline - share @ lattice.baseline) ** 2).mean()
     pixels = 4 * np.pi * (_SMOOTH**2 + _WINDOW**2)
     deviation = 1 / np.sqrt(np.maximum(evidence, 1e-3) * gain * spread * pixels)
-    jump = (maximum_filter(disparity, 5) - minimum_filter(disparity, 5)) / 2
+    # Beside a jump a point is right or wrong by all of it, at even chances.
+    jump = (maximum_filter(disparity, 5) - minimum_filter(disparity, 5)) / np.sqrt(2)
     deviation = np.maximum.reduce(
         [np.hypot(deviation, _LIMIT), np.abs(rough - disparity), jump]
     ).astype(np.float32)

@@ -6,7 +6,7 @@ are smoothed along paths, and the map within the surfaces that the picture shows
 
 import numba
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 
 _SLANT, _JUMP = 0.02, 1.0
 """Prices of a step by one plane and of a jump, in the typical spread of the evidence."""
@@ -14,14 +14,17 @@ _SLANT, _JUMP = 0.02, 1.0
 _CLEAR = 0.055
 """Share of the energy that a neighbourhood has to explain better to contradict a plane."""
 
-_REACH, _CONTRAST = 10.0, 0.04
-"""How far the filling reaches, px, and the contrast in the picture that stops it."""
+_REACH, _CONTRAST = 7.0, 0.035
+"""How far the settling reaches, px, and the contrast in the picture that stops it."""
 
 _WRONG = 0.12
 """Disparity beyond which neighbours do not mean the same surface, px per pitch."""
 
-_CHANCE, _ENOUGH = 4.0, 60.0
-"""Evidence that noise alone shows in the mean of a neighbourhood, and evidence that is plenty."""
+ENOUGH = 60.0
+"""Evidence beyond which a point counts no more."""
+
+_STEEP = 0.035
+"""Slope of a map at which its points count a quarter, px per pitch and px."""
 
 
 # --- smoothing --------------------------------------------------------------------------------
@@ -101,47 +104,37 @@ def is_relief(cost: np.ndarray, planes: np.ndarray, rough: np.ndarray, usual: np
     return float(np.mean(gain > _CLEAR)) > 0.005
 
 
-# --- filling ----------------------------------------------------------------------------------
+# --- settling ---------------------------------------------------------------------------------
 
 
-def settled(
-    rough: np.ndarray, evidence: np.ndarray, picture: np.ndarray, usual: np.ndarray
-) -> np.ndarray:
-    """Smooth a disparity map within the surfaces that the picture shows, and fill its gaps.
+def trusted(rough: np.ndarray, evidence: np.ndarray) -> np.ndarray:
+    """Return how much every point of a map counts, (H, W), 0..1.
+
+    Surfaces are seldom steep. Around an edge, which some units see move with the near side and
+    some with the far one, a map climbs from one surface to the other and is true for neither.
+    """
+    slope = gaussian_gradient_magnitude(rough, 3.0)
+    return np.clip(evidence / ENOUGH, 0, 1) / (1 + (slope / _STEEP) ** 2) ** 2
+
+
+def settled(rough: np.ndarray, believed: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """Smooth a disparity map within the surfaces that the picture shows.
 
     Minimises sum w (d - rough)^2 + sum a (d_p - d_q)^2 over neighbours, a falling with their
     contrast, in turns: each point then counts by how well it agreed. An edge in the picture belongs
     to the nearer side, so that a surface is at most as near as its edges: points that would draw it
     nearer hardly count.
     """
-    textured = gaussian_filter(evidence, 3.0) > _CHANCE
-    believed = np.where(textured, np.clip(evidence / _ENOUGH, 0, 1), 0).astype(np.float32)
     bonds = [np.exp(-np.abs(np.diff(picture, axis=axis)) / _CONTRAST) for axis in (1, 0)]
     along, down = (np.ascontiguousarray(bond, np.float32) for bond in (bonds[0], bonds[1].T))
-    # Where nothing is to be seen stands, to begin with, what stands anywhere around.
-    far = usual + _averaged(rough - usual, believed, along, down, 8 * _REACH, 1e-4)
-    rough = np.where(textured, rough, far.astype(np.float32))
-    believed = believed + np.float32(1e-5)
-    weight = believed
+    weight = believed = (believed + 1e-5).astype(np.float32)
     for _ in range(6):
-        disparity = _averaged(rough, weight, along, down, _REACH)
+        both = _diffuse(np.stack([weight * rough, weight]), along, down, _REACH)
+        disparity = both[0] / (both[1] + np.float32(1e-30))
         above = rough - disparity
         doubt = np.where(above > _WRONG, 1e4, (1 + (above / _WRONG) ** 2) ** 2)
         weight = (believed / doubt).astype(np.float32)
     return disparity
-
-
-def _averaged(
-    values: np.ndarray,
-    weight: np.ndarray,
-    along: np.ndarray,
-    down: np.ndarray,
-    reach: float,
-    none: float = 1e-30,
-) -> np.ndarray:
-    """Return weighted means over surfaces; they go to zero where the weight falls below `none`."""
-    both = _diffuse(np.stack([weight * values, weight]), along, down, reach)
-    return both[0] / (both[1] + np.float32(none))
 
 
 def _diffuse(fields: np.ndarray, along: np.ndarray, down: np.ndarray, reach: float) -> np.ndarray:
