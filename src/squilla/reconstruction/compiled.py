@@ -27,7 +27,7 @@ from squilla.reconstruction.evidence import (
     Camera,
     Evidence,
 )
-from squilla.reconstruction.prior import LEADING
+from squilla.reconstruction.prior import BEYOND, LEADING
 from squilla.threads import single_threaded_products
 
 compiled = numba.njit(
@@ -36,7 +36,8 @@ compiled = numba.njit(
     nogil=True,
     cache=True,
 )
-ONE, _HALF, _MODEL = np.float32(1), np.float32(0.5), np.float32(MODEL_NOISE)
+ONE, _HALF = np.float32(1), np.float32(0.5)
+_MODEL, _BEYOND = np.float32(MODEL_NOISE), np.float32(BEYOND)
 _ROWS = 16
 """Rows of a picture that are worked on at a time where a step leaves something to the next."""
 
@@ -180,21 +181,30 @@ def _viewed(first: int, last: int, y: np.ndarray, project: np.ndarray, *argument
 
 
 @compiled
-def _coarser(first, last, fine, view):
+def _coarser(first, last, fine, power, view):
+    scale, share = np.empty(TOLD, np.float32), np.empty((4, 4), np.float32)
     for row in range(first, last):
         for column in range(view.shape[1]):
-            cell, weight = view[row, column], np.float32(0)
-            cell[:] = 0
-            for y in range(2):
-                for x in range(2):
-                    part = fine[2 * row + y, 2 * column + x]
-                    share = ONE / part[0]
-                    weight += share
-                    for i in range(1, cell.size):
-                        cell[i] += share * part[i]
+            parts = (
+                fine[2 * row, 2 * column], fine[2 * row, 2 * column + 1],
+                fine[2 * row + 1, 2 * column], fine[2 * row + 1, 2 * column + 1],
+            )  # fmt: skip
+            for i in range(4):
+                share[i, i] = ONE / parts[i][0]
+                for j in range(i):
+                    against = _telling(parts[i][0] + parts[j][0] + 2 * _MODEL, power, scale)
+                    alike = sigmoid(against - _difference(parts[i], parts[j], scale))
+                    share[i, j], share[j, i] = alike / parts[j][0], alike / parts[i][0]
+            most, certainty = 0, np.float32(0)
+            for i in range(4):
+                total = share[i, 0] + share[i, 1] + share[i, 2] + share[i, 3]
+                if total > certainty:
+                    most, certainty = i, total
+            p, q, r, s = share[most] / certainty
+            cell = view[row, column]
             for i in range(1, cell.size):
-                cell[i] /= weight
-            cell[0] = ONE / weight
+                cell[i] = p * parts[0][i] + q * parts[1][i] + r * parts[2][i] + s * parts[3][i]
+            cell[0] = ONE / certainty
 
 
 @compiled
@@ -324,46 +334,63 @@ def _wiener(first, last, view, zone, vectors, power, gain, own):
 
 @compiled
 def _mixture(
-    first, last, scores, view, zone, offset, power, gain, mean, log_share, within, leading,
-    found, variance, features,
+    first, last, scores, view, zone, pieces, reach, offset, power, gain, mean, log_share, within,
+    leading, found, variance, features,
 ):  # fmt: skip
-    """Write the posterior of `Estimators.mixture`; clusters without a say are left out."""
+    """Write the posterior of `Estimators.mixture`; clusters without a say are left out.
+
+    scores : of every cell, by what was learnt, and how far it goes along the middle of each piece.
+    """
     clusters, directions = power.shape[1:]
-    size, nodes = found.shape[2], log_share.shape[1]
+    size, nodes, learnt = found.shape[2], log_share.shape[1], clusters - reach.shape[1]
     scaled = np.empty(directions, np.float32)
-    weight = np.empty(clusters, np.float32)
+    score = np.empty((clusters, directions), np.float32)
     each = np.empty((clusters, size), np.float32)
+    weight = np.empty(clusters, np.float32)
+    likely = np.empty(clusters, np.int64)
     for row in range(first, last):
         for column in range(found.shape[1]):
-            score, where = scores[row, column], zone[row, column]
+            seen, where, cell = scores[row, column], zone[row, column], view[row, column, 2:]
             noise = view[row, column, 0] + _MODEL
-            for i in range(score.size):
-                score[i] -= offset[where, i]
+            beside = -_BEYOND * directions * noise
+            for i in range(directions):
+                beside += cell[i] * cell[i]
+            count = learnt
+            for k in range(learnt):
+                likely[k] = k
+                for i in range(directions):
+                    score[k, i] = seen[k * directions + i] - offset[where, k, i]
+            for piece in range(clusters - learnt):
+                along = seen[learnt * directions + piece]
+                if beside - along * along <= reach[where, piece]:
+                    k = learnt + piece
+                    likely[count] = k
+                    count += 1
+                    score[k] = -offset[where, k]
+                    add_product(cell, pieces[where, piece], score[k])
             place = min(max(math.log10(noise) * 2 + 10, 0.0), nodes - 1.0)
             low = min(int(place), nodes - 2)
             high = np.float32(place - low)
-            most = np.float32(-np.inf)
-            for k in range(clusters):
+            tables, most = log_share[where], np.float32(-np.inf)
+            for k in likely[:count]:
                 misfit = np.float32(0)
                 for i in range(directions):
-                    value = score[k * directions + i]
-                    misfit += value * value / (power[where, k, i] + noise)
-                tables = log_share[where]
+                    misfit += score[k, i] * score[k, i] / (power[where, k, i] + noise)
                 weight[k] = (ONE - high) * tables[low, k] + high * tables[low + 1, k] - misfit / 2
                 most = max(most, weight[k])
             total = np.float32(0)
-            for k in range(clusters):
+            for k in likely[:count]:
                 weight[k] = math.exp(weight[k] - most)
                 total += weight[k]
             mixed, spread = found[row, column], variance[row, column]
             mixed[:] = 0
             spread[:] = 0
-            for k in range(clusters):
+            for k in likely[:count]:
                 weight[k] /= total
                 if weight[k] < _LIKELY:
                     continue
                 for i in range(directions):
-                    scaled[i] = score[k * directions + i] / (power[where, k, i] + noise)
+                    scaled[i] = score[k, i] / (power[where, k, i] + noise)
                 each[k] = mean[where, k]
                 add_product(scaled, gain[where, k], each[k])
                 near, far = weight[k] * (ONE - high), weight[k] * high
@@ -371,7 +398,7 @@ def _mixture(
                 for i in range(size):
                     mixed[i] += weight[k] * each[k, i]
                     spread[i] += near * one[i] + far * other[i]
-            for k in range(clusters):
+            for k in likely[:count]:
                 if weight[k] >= _LIKELY:
                     for i in range(leading):
                         apart = each[k, i] - mixed[i]
@@ -389,7 +416,6 @@ class CompiledCamera:
 
     def __init__(self, camera: Camera):
         zones = camera.zones
-        clusters = len(zones[0].cluster_power)
 
         def stacked(name: str) -> np.ndarray:
             return np.ascontiguousarray(np.stack([getattr(zone, name) for zone in zones]))
@@ -400,15 +426,18 @@ class CompiledCamera:
         self.quiet, self.power = np.ascontiguousarray(camera.quiet.numpy()), camera.power.numpy()
         self.vectors, self.spread, gain = map(stacked, ("vectors", "power", "gain"))
         self.gains = [np.ascontiguousarray(gain[..., :size]) for size in CORRECTED]
-        self.scores = stacked("scores")
-        within = stacked("within")
+        learnt, scores = zones[0].learnt, stacked("scores")  # (Z, D, G, D)
+        known = scores[:, :, :learnt].reshape(*scores.shape[:2], -1)
+        self.scores = np.concatenate([known, stacked("middle")], -1)
         self.mixture = (
+            np.ascontiguousarray(scores[:, :, learnt:].swapaxes(1, 2)),
+            stacked("reach"),
             stacked("offset"),
             stacked("cluster_power"),
             stacked("cluster_gain"),
             stacked("mean"),
             stacked("log_share"),
-            within.reshape(len(zones), -1, clusters, within.shape[-1]),
+            stacked("within"),
             LEADING,
         )
 
@@ -458,7 +487,7 @@ def gather_evidence(
     """
     step = 2**LEVELS
     sides = tuple(side + -side % step for side in ratio.shape)
-    size, basis = camera.vectors.shape[1], camera.mixture[2].shape[-1]
+    size, basis = camera.vectors.shape[1], camera.mixture[4].shape[-1]
 
     def run(kernel: Callable[..., None], rows: int, *arguments) -> None:
         over_rows(kernel, rows, threads, *arguments)
@@ -473,7 +502,7 @@ def gather_evidence(
     told = np.float32(factor), np.float32(max(floor, 1e-30)), camera.channels
     run(_viewed, sides[0], y, camera.project, ratio, *told, views[0])
     for level in range(1, LEVELS + 1):
-        run(_coarser, len(views[level]), views[level - 1], views[level])
+        run(_coarser, len(views[level]), views[level - 1], camera.power, views[level])
     known = [views[0]]
     for view in views[1:]:
         known.append(np.empty_like(view))
