@@ -352,30 +352,34 @@ def _mixture(
         for column in range(found.shape[1]):
             seen, where, cell = scores[row, column], zone[row, column], view[row, column, 2:]
             noise = view[row, column, 0] + _MODEL
-            beside = -_BEYOND * directions * noise
-            for i in range(directions):
-                beside += cell[i] * cell[i]
             count = learnt
             for k in range(learnt):
                 likely[k] = k
+                own, shift = score[k], offset[where, k]
                 for i in range(directions):
-                    score[k, i] = seen[k * directions + i] - offset[where, k, i]
-            for piece in range(clusters - learnt):
-                along = seen[learnt * directions + piece]
-                if beside - along * along <= reach[where, piece]:
-                    k = learnt + piece
-                    likely[count] = k
-                    count += 1
-                    score[k] = -offset[where, k]
-                    add_product(cell, pieces[where, piece], score[k])
+                    own[i] = seen[k * directions + i] - shift[i]
+            beside, closest = -_BEYOND * np.float32(directions) * noise, np.float32(-np.inf)
+            for i in range(directions):
+                beside += cell[i] * cell[i]
+            along, wide = seen[learnt * directions :], reach[where]
+            for piece in range(wide.size):
+                closest = max(closest, along[piece] * along[piece] + wide[piece])
+            if closest >= beside:
+                for piece in range(wide.size):
+                    if along[piece] * along[piece] + wide[piece] >= beside:
+                        k = learnt + piece
+                        likely[count] = k
+                        count += 1
+                        score[k] = -offset[where, k]
+                        add_product(cell, pieces[where, piece], score[k])
             place = min(max(math.log10(noise) * 2 + 10, 0.0), nodes - 1.0)
             low = min(int(place), nodes - 2)
             high = np.float32(place - low)
             tables, most = log_share[where], np.float32(-np.inf)
             for k in likely[:count]:
-                misfit = np.float32(0)
+                misfit, own, known = np.float32(0), score[k], power[where, k]
                 for i in range(directions):
-                    misfit += score[k, i] * score[k, i] / (power[where, k, i] + noise)
+                    misfit += own[i] * own[i] / (known[i] + noise)
                 weight[k] = (ONE - high) * tables[low, k] + high * tables[low + 1, k] - misfit / 2
                 most = max(most, weight[k])
             total = np.float32(0)
@@ -389,8 +393,9 @@ def _mixture(
                 weight[k] /= total
                 if weight[k] < _LIKELY:
                     continue
+                own, known = score[k], power[where, k]
                 for i in range(directions):
-                    scaled[i] = score[k, i] / (power[where, k, i] + noise)
+                    scaled[i] = own[i] / (known[i] + noise)
                 each[k] = mean[where, k]
                 add_product(scaled, gain[where, k], each[k])
                 near, far = weight[k] * (ONE - high), weight[k] * high

@@ -281,12 +281,13 @@ class Estimators:
         self.offset = torch.einsum("gd,gde->ge", mean @ seen.T, vectors).float()  # (G, D)
         total = power + 10 ** (_NODES.double() / 2 - 5)[:, None, None]  # (J, G, D)
         self.log_share = (prior.share.log() - total.log().sum(-1) / 2).float()  # (J, G)
-        # Pieces of the sheet count only for shapes that lie beside their mean by no more than this.
-        piece = slice(prior.learnt, None)
         self.learnt = prior.learnt
-        self.reach = _WITHIN * power[piece].sum(-1).float()  # (L,)
+        piece = slice(prior.learnt, None)
         middle = mean[piece] @ seen.T
-        self.middle = (middle / middle.norm(dim=1, keepdim=True)).T.contiguous().float()  # (D, L)
+        middle = middle / middle.norm(dim=1, keepdim=True)  # (L, D)
+        beside = 1 - torch.einsum("gd,gde->ge", middle, vectors[piece]).square()
+        self.middle = middle.T.contiguous().float()  # (D, L)
+        self.reach = _WITHIN * (power[piece] * beside).sum(-1).float()  # (L,)
         prior_variance = covariance.diagonal(dim1=-2, dim2=-1)
         within = prior_variance - torch.einsum("jgd,gdc->jgc", 1 / total, gain.square())
         self.within = within.clamp_min(1e-10).float()  # (J, G, C)
