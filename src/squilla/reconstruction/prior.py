@@ -141,7 +141,7 @@ def fit_prior(
         Size of the basis, C.
     """
     everything = torch.cat([spectra for spectra, _ in families.values()]).double()
-    basis = torch.linalg.eigh(everything.T @ everything)[1].flip(1)[:, :components]
+    basis = torch.linalg.eigh(everything.T @ everything)[1].flip(1)[:, :components].contiguous()
     peaked = everything @ basis
     share, mean, covariance = [], [], []
     for spectra, clusters in families.values():
