@@ -13,16 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from squilla.reconstruction.compiled import (
-    ONE,
-    compiled,
-    inherited,
-    over_rows,
-    sigmoid,
-    times,
-)
+from squilla.reconstruction.compiled import inherited
 from squilla.reconstruction.engine import Network
 from squilla.reconstruction.evidence import CORRECTED, SPECTRAL, Evidence
+from squilla.reconstruction.kernels import ONE, compiled, over_rows, sigmoid, times
 from squilla.threads import single_threaded_products
 
 _CHANGED = CORRECTED[0]

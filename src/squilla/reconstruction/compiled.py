@@ -1,19 +1,14 @@
 """The front end of the compound model on a processor: `evidence` in loops that pass memory once.
 
 The functions of `evidence` say what is computed; these compute it for one picture at a time, in a
-third of the time, and the tests hold both together. Every kernel works on some rows of a picture
-and lets go of the interpreter's lock, so that plain threads share the rows.
+third of the time, and the tests hold both together.
 
 A view is one array, (H, W, 2 + D): noise variance, amplitude, and the shape in D directions.
 """
 
 import math
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from itertools import pairwise
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -24,47 +19,18 @@ from squilla.reconstruction.evidence import (
     MODEL_NOISE,
     SPECTRAL,
     TOLD,
-    Camera,
     Evidence,
 )
-from squilla.reconstruction.prior import BEYOND, LEADING
+from squilla.reconstruction.kernels import ONE, add_product, compiled, over_rows, sigmoid
+from squilla.reconstruction.posteriors import CompiledCamera, by_zone, mixture, wiener
 from squilla.threads import single_threaded_products
 
-compiled = numba.njit(
-    fastmath={"reassoc", "contract", "nsz", "arcp"},
-    error_model="numpy",
-    nogil=True,
-    cache=True,
-)
-ONE, _HALF = np.float32(1), np.float32(0.5)
-_MODEL, _BEYOND = np.float32(MODEL_NOISE), np.float32(BEYOND)
+_HALF, _MODEL = np.float32(0.5), np.float32(MODEL_NOISE)
 _ROWS = 16
 """Rows of a picture that are worked on at a time where a step leaves something to the next."""
 
-_LIKELY = np.float32(1e-6)
-"""Clusters less likely than this leave no trace in a posterior."""
-
 
 # --- sums over the channels of a cell -----------------------------------------------------------
-
-
-@compiled
-def add_product(vector, matrix, total):
-    """Add vector @ matrix to `total`; four rows at a time keep the sums in registers."""
-    rows, columns = matrix.shape
-    whole = rows - rows % 4
-    for i in range(0, whole, 4):
-        a, b, c, d = vector[i], vector[i + 1], vector[i + 2], vector[i + 3]
-        for j in range(columns):
-            total[j] += (
-                a * matrix[i, j]
-                + b * matrix[i + 1, j]
-                + c * matrix[i + 2, j]
-                + d * matrix[i + 3, j]
-            )
-    for i in range(whole, rows):
-        for j in range(columns):
-            total[j] += vector[i] * matrix[i, j]
 
 
 @compiled
@@ -88,11 +54,6 @@ def _difference(one, other, scale):
         apart = one[2 + i] - other[2 + i]
         total += apart * apart * scale[i]
     return total
-
-
-@compiled
-def sigmoid(x):
-    return ONE / (ONE + math.exp(-x))
 
 
 # --- from the measurement to views of every level -----------------------------------------------
@@ -294,157 +255,7 @@ def _besides_itself(first, last, alone, known, mixed):
                 cell[i] += itself * (own[i] - cell[i])
 
 
-# --- posteriors ---------------------------------------------------------------------------------
-
-
-@compiled
-def _zoned(first, last, view, zone, matrices, product):
-    """Multiply the shape of every cell by the matrix of its zone: a run of one zone at a time."""
-    width = view.shape[1]
-    shape = np.empty((width, matrices.shape[1]), np.float32)
-    for row in range(first, last):
-        start = 0
-        while start < width:
-            where, stop = zone[row, start], start
-            while stop < width and zone[row, stop] == where:
-                shape[stop] = view[row, stop, 2:]
-                stop += 1
-            np.dot(shape[start:stop], matrices[where], product[row][start:stop])
-            start = stop
-
-
-@compiled
-def _wiener(first, last, view, zone, vectors, power, gain, own):
-    """Write the linear estimate of `Estimators.wiener`, as many coefficients as `own` has."""
-    score = np.empty((1, view.shape[1], vectors.shape[2]), np.float32)
-    for row in range(first, last):
-        here, places = view[row : row + 1], zone[row : row + 1]
-        _zoned(0, 1, here, places, vectors, score)
-        start = 0
-        while start < view.shape[1]:
-            where, stop = zone[row, start], start
-            while stop < view.shape[1] and zone[row, stop] == where:
-                cell, noise = score[0, stop], view[row, stop, 0] + _MODEL
-                for i in range(cell.size):
-                    cell[i] /= power[where, i] + noise
-                stop += 1
-            np.dot(score[0][start:stop], gain[where], own[row][start:stop])
-            start = stop
-
-
-@compiled
-def _mixture(
-    first, last, scores, view, zone, pieces, reach, offset, power, gain, mean, log_share, within,
-    leading, found, variance, features,
-):  # fmt: skip
-    """Write the posterior of `Estimators.mixture`; clusters without a say are left out.
-
-    scores : of every cell, by what was learnt, and how far it goes along the middle of each piece.
-    """
-    clusters, directions = power.shape[1:]
-    size, nodes, learnt = found.shape[2], log_share.shape[1], clusters - reach.shape[1]
-    scaled = np.empty(directions, np.float32)
-    score = np.empty((clusters, directions), np.float32)
-    each = np.empty((clusters, size), np.float32)
-    weight = np.empty(clusters, np.float32)
-    likely = np.empty(clusters, np.int64)
-    for row in range(first, last):
-        for column in range(found.shape[1]):
-            seen, where, cell = scores[row, column], zone[row, column], view[row, column, 2:]
-            noise = view[row, column, 0] + _MODEL
-            count = learnt
-            for k in range(learnt):
-                likely[k] = k
-                own, shift = score[k], offset[where, k]
-                for i in range(directions):
-                    own[i] = seen[k * directions + i] - shift[i]
-            beside, closest = -_BEYOND * np.float32(directions) * noise, np.float32(-np.inf)
-            for i in range(directions):
-                beside += cell[i] * cell[i]
-            along, wide = seen[learnt * directions :], reach[where]
-            for piece in range(wide.size):
-                closest = max(closest, along[piece] * along[piece] + wide[piece])
-            if closest >= beside:
-                for piece in range(wide.size):
-                    if along[piece] * along[piece] + wide[piece] >= beside:
-                        k = learnt + piece
-                        likely[count] = k
-                        count += 1
-                        score[k] = -offset[where, k]
-                        add_product(cell, pieces[where, piece], score[k])
-            place = min(max(math.log10(noise) * 2 + 10, 0.0), nodes - 1.0)
-            low = min(int(place), nodes - 2)
-            high = np.float32(place - low)
-            tables, most = log_share[where], np.float32(-np.inf)
-            for k in likely[:count]:
-                misfit, own, known = np.float32(0), score[k], power[where, k]
-                for i in range(directions):
-                    misfit += own[i] * own[i] / (known[i] + noise)
-                weight[k] = (ONE - high) * tables[low, k] + high * tables[low + 1, k] - misfit / 2
-                most = max(most, weight[k])
-            total = np.float32(0)
-            for k in likely[:count]:
-                weight[k] = math.exp(weight[k] - most)
-                total += weight[k]
-            mixed, spread = found[row, column], variance[row, column]
-            mixed[:] = 0
-            spread[:] = 0
-            for k in likely[:count]:
-                weight[k] /= total
-                if weight[k] < _LIKELY:
-                    continue
-                own, known = score[k], power[where, k]
-                for i in range(directions):
-                    scaled[i] = own[i] / (known[i] + noise)
-                each[k] = mean[where, k]
-                add_product(scaled, gain[where, k], each[k])
-                near, far = weight[k] * (ONE - high), weight[k] * high
-                one, other = within[where, low, k], within[where, low + 1, k]
-                for i in range(size):
-                    mixed[i] += weight[k] * each[k, i]
-                    spread[i] += near * one[i] + far * other[i]
-            for k in likely[:count]:
-                if weight[k] >= _LIKELY:
-                    for i in range(leading):
-                        apart = each[k, i] - mixed[i]
-                        spread[i] += weight[k] * apart * apart
-            evidence = (most + math.log(total)) / directions
-            features[row, column, 0] = math.log(noise)
-            features[row, column, 1] = min(max(evidence, np.float32(-20)), np.float32(20))
-
-
 # --- all of it ----------------------------------------------------------------------------------
-
-
-class CompiledCamera:
-    """The matrices of a `Camera` as the kernels take them; one set for each zone."""
-
-    def __init__(self, camera: Camera):
-        zones = camera.zones
-
-        def stacked(name: str) -> np.ndarray:
-            return np.ascontiguousarray(np.stack([getattr(zone, name) for zone in zones]))
-
-        self.channels = np.float32(camera.channels)
-        self.project = camera.project.numpy()
-        self.flat = np.ascontiguousarray(camera.project[:, -1].numpy())
-        self.quiet, self.power = np.ascontiguousarray(camera.quiet.numpy()), camera.power.numpy()
-        self.vectors, self.spread, gain = map(stacked, ("vectors", "power", "gain"))
-        self.gains = [np.ascontiguousarray(gain[..., :size]) for size in CORRECTED]
-        learnt, scores = zones[0].learnt, stacked("scores")  # (Z, D, G, D)
-        known = scores[:, :, :learnt].reshape(*scores.shape[:2], -1)
-        self.scores = np.concatenate([known, stacked("middle")], -1)
-        self.mixture = (
-            np.ascontiguousarray(scores[:, :, learnt:].swapaxes(1, 2)),
-            stacked("reach"),
-            stacked("offset"),
-            stacked("cluster_power"),
-            stacked("cluster_gain"),
-            stacked("mean"),
-            stacked("log_share"),
-            stacked("within"),
-            LEADING,
-        )
 
 
 def light(y: np.ndarray, threads: int) -> np.ndarray:
@@ -531,15 +342,15 @@ def gather_evidence(
     coefficients = empty(SPECTRAL, basis)
     variance, features = np.empty_like(coefficients), empty(SPECTRAL, 2)
     place, scores = places[SPECTRAL], empty(SPECTRAL, camera.scores.shape[-1])
-    run(_zoned, len(spectral), spectral, place, camera.scores, scores)
+    run(by_zone, len(spectral), spectral, place, camera.scores, scores)
     run(
-        _mixture, len(spectral), scores, spectral,
+        mixture, len(spectral), scores, spectral,
         place, *camera.mixture, coefficients, variance, features,
     )  # fmt: skip
     own = [empty(level, CORRECTED[level]) for level in range(SPECTRAL)]
     for level, (view, place) in enumerate(zip(known[:SPECTRAL], places, strict=False)):
         matrices = camera.vectors, camera.spread, camera.gains[level]
-        run(_wiener, len(view), view, place, *matrices, own[level])
+        run(wiener, len(view), view, place, *matrices, own[level])
 
     def pictures(values: Iterable[np.ndarray]) -> list[Tensor]:
         return [torch.from_numpy(value)[None] for value in values]
@@ -567,28 +378,3 @@ def _zones(zone: np.ndarray | None, sides: tuple[int, ...], level: int) -> np.nd
         return np.zeros([side >> level for side in sides], np.int64)
     filled = np.pad(zone, [(0, side - own) for side, own in zip(sides, zone.shape, strict=True)])
     return filled[2**level // 2 :: 2**level, 2**level // 2 :: 2**level]
-
-
-def times(first: int, last: int, picture: np.ndarray, matrix: np.ndarray, product: np.ndarray):
-    """Multiply every cell of some rows by a matrix."""
-    np.matmul(picture[first:last], matrix, out=product[first:last])
-
-
-def over_rows(kernel: Callable[..., None], rows: int, threads: int, *arguments) -> None:
-    """Call a kernel for all rows, shared by threads."""
-    # Twice as many parts as threads, since the machine may have other work; but no small ones.
-    parts = min(rows // 32, 2 * threads)
-    if threads == 1 or parts < 2:
-        kernel(0, rows, *arguments)
-        return
-    edges = [rows * number // parts for number in range(parts + 1)]
-    futures = [
-        _pool(threads).submit(kernel, first, last, *arguments) for first, last in pairwise(edges)
-    ]
-    for future in futures:
-        future.result()
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="squilla-rows")

@@ -24,7 +24,6 @@ from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.reconstruction import compiled
 from squilla.reconstruction.coded import Coded, refine
-from squilla.reconstruction.compiled import CompiledCamera
 from squilla.reconstruction.engine import Network, compile_network, write_onnx
 from squilla.reconstruction.evidence import (
     CORRECTED,
@@ -36,6 +35,7 @@ from squilla.reconstruction.evidence import (
     noise_factor,
 )
 from squilla.reconstruction.partial import CodedReconstruction, Reconstruction
+from squilla.reconstruction.posteriors import CompiledCamera
 from squilla.reconstruction.prior import Prior, broad_prior
 from squilla.reconstruction.reconstructor import (
     Reconstructor,
