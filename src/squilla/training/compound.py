@@ -18,7 +18,8 @@ from torch.nn import functional
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.files.disk import replacing
-from squilla.reconstruction.compound import ZONES, BackEnd, Compound
+from squilla.reconstruction.back_end import BackEnd
+from squilla.reconstruction.compound import ZONES, Compound
 from squilla.reconstruction.evidence import (
     CORRECTED,
     LEVELS,
