@@ -39,6 +39,9 @@ PIXELS, BANDS = 250 * 250, 251
 RESPECNN = 10.3e6
 """Multiply-adds of ReSpecNN for a pixel."""
 
+BATCH = 4096
+"""Pixels that a user of PyTorch may give a network at once; squilla's pieces fit the caches."""
+
 
 def cameras() -> tuple[Calibration, Calibration]:
     """Return a camera with one field angle, and the same with five."""
@@ -64,7 +67,9 @@ def compound_products(model) -> float:
     cells = {4: PIXELS / 16, 2: PIXELS / 4, 1: PIXELS}
     total = PIXELS * 36 * 33 + PIXELS / 2 * 36 * 18  # projections, and the noise
     total += PIXELS * 32 * (32 + 16) + PIXELS / 4 * 32 * (32 + 32)  # linear estimates
-    total += cells[4] * (32 * 26 * 32 + 32 * 64)  # the mixture, one cluster taken up
+    learnt, pieces = model.prior.learnt, len(model.prior.share) - model.prior.learnt
+    # The mixture, one cluster taken up, and how near the pieces of the sheet of lines are.
+    total += cells[4] * (32 * (32 * learnt + pieces) + 32 * 64)
     for side, network in zip((4, 1, 2), model.back.networks(), strict=True):
         weights = sum(value.numel() for value in network.parameters() if value.ndim > 1)
         total += cells[side] * weights
@@ -124,6 +129,16 @@ def rows(options: argparse.Namespace) -> dict[str, tuple[Callable[[], object], f
     result["ridge"] = lambda: ridge.reconstruct(seen), PIXELS * 36 * (36 + BANDS), whole
     if options.network:
         torch.manual_seed(0)
+        plain = model_class("respecnn")(flat).eval().for_engines()
+        inputs = seen.y.flatten(0, 1) / seen.y.flatten(0, 1).amax(-1, keepdim=True)
+
+        @torch.inference_mode()
+        def batches() -> None:
+            torch.cat([plain(batch) for batch in inputs.split(BATCH)])
+
+        result[f"respecnn, plain PyTorch, {BATCH} pixels at once"] = (
+            batches, PIXELS * RESPECNN, whole,
+        )  # fmt: skip
         for engine in [name for name in ("torch", "openvino", "openvino-bf16") if name in engines]:
             network = model_class("respecnn")(flat).eval().with_engine(engine)
             print(f"respecnn, {engine}: {network.provenance['engine_error']:.1e} from torch")

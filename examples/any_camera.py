@@ -41,7 +41,9 @@ for axis, name in zip(axes[1:3], ("ridge", "compound"), strict=True):
 for colour, (row, column) in places.items():
     axes[3].plot(wavelength, scene.squilla.spectrum(row, column), color=colour, alpha=0.3, lw=4)
     axes[0].plot(column, row, "o", color=colour, markeredgecolor="white")
-axes[3].set(title="pale: truth; dotted: ridge", xlabel="nm", yticks=[])
+axes[3].set(
+    title="pale: truth; dotted: ridge", xlabel="wavelength, nm", ylabel="photon radiance", yticks=[]
+)
 for each in axes[:3]:
     each.set(xticks=[], yticks=[])
 figure.savefig(folder / "any_camera.webp", dpi=110)

@@ -36,7 +36,7 @@ for name, chosen in (("the tenth most alike", angle < near), ("most unlike", ang
     low, middle, high = np.percentile(some, (10, 50, 90), axis=0)
     plot.fill_between(cube.wavelength, low, high, alpha=0.3)
     plot.plot(cube.wavelength, middle, label=name)
-plot.set(xlabel="nm", yticks=[])
+plot.set(xlabel="wavelength, nm", ylabel="relative radiance", yticks=[])
 plot.legend(frameon=False, fontsize="small")
 for each in (picture, alike):
     each.set(xticks=[], yticks=[])

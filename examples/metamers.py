@@ -41,6 +41,11 @@ for name, column, colour in (("left", 60, "#0f8b8d"), ("right", 190, "#d1495b"))
     plot.plot(wavelength, true / true.max(), color=colour, alpha=0.4, linewidth=4)
     found = cube.squilla.spectrum(125, column, 20)
     plot.plot(wavelength, found / found.max(), color=colour, label=name)
-plot.set(title="as the camera sees it; pale: the truth", xlabel="nm", yticks=[])
+plot.set(
+    title="as the camera sees it; pale: the truth",
+    xlabel="wavelength, nm",
+    ylabel="relative radiance",
+    yticks=[],
+)
 plot.legend(frameon=False)
 figure.savefig(folder / "metamers.webp", dpi=110)

@@ -105,6 +105,8 @@ def test_bad_input():
         blue_shift(WIDE, ([0.1], [1.0]), 0.9)
     with pytest.raises(InputError, match="480-780 nm"):
         blue_shift(WIDE, ([0.1], [1.0]), 1.7, onto=[470.0])
+    with pytest.raises(InputError, match="points of the pupil"):
+        blue_shift(WIDE, pupil(0.1), 1.7, measured_in=([0.0, 0.1], [0.5, 0.5]))
     with pytest.raises(InputError, match="all are on the axis"):
         fit_effective_index(response, response[None], WIDE, [([0.0], [1.0])])
     with pytest.raises(InputError, match="2 cones"):

@@ -22,7 +22,7 @@ from squilla.reconstruction.evidence import (
     noise_factor,
 )
 from squilla.reconstruction.models import load_model
-from squilla.reconstruction.prior import Estimators, Prior, broad_prior, fit_mixture
+from squilla.reconstruction.prior import Estimators, Prior, broad_prior, fit_mixture, line_sheet
 from squilla.spectra import CHART_LIGHT, grid, lights
 from squilla.training.compound import Recipe, Studio, from_checkpoint, misaligned, train_compound
 from squilla.training.noise import add_noise
@@ -56,6 +56,7 @@ def tiny_prior(clusters, size=5):
         torch.full((clusters,), 1 / clusters, dtype=torch.float64),
         mean,
         root @ root.mT + 0.05 * torch.eye(size, dtype=torch.float64),
+        clusters,
     )
 
 
@@ -97,6 +98,37 @@ def test_the_linear_estimate_is_the_textbooks():
     torch.testing.assert_close(found.double(), y.double() @ gain.T, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("fwhm", [6.0, 15.0, 28.0])
+def test_single_lines_are_found_to_a_nanometre(fwhm):
+    """By the prior alone; pieces of the sheet stay away from other spectra."""
+    prior = broad_prior()
+    wavelength = prior.wavelength
+    camera = Camera(smooth_camera(0, filters=30).sensitivities, prior)
+    response = smooth_camera(0, filters=30).sensitivities[0]
+    centre = torch.linspace(520, 730, 43, dtype=torch.float64)[:, None]
+    spectra = (-4 * np.log(2) * ((torch.from_numpy(wavelength) - centre) / fwhm) ** 2).exp()
+    few = natural_spectra(200, wavelength, generator=torch.Generator().manual_seed(2))
+    projected = torch.cat([spectra.float(), few]) @ response.T @ camera.project
+    shape = projected[:, :-1] / projected[:, -1:]
+    noise = torch.full((len(shape),), 2e-5)
+    (zone,) = camera.zones
+    mean, _, _ = zone.mixture(shape, noise)
+    found = (mean[:43].double() @ prior.basis.T).argmax(1)
+    off = torch.from_numpy(wavelength)[found] - centre[:, 0]
+    assert off.abs().max() <= 1.5
+    assert off.abs().mean() < 0.6
+    near = zone.near(shape, noise)
+    assert near[:43].any(1).all()
+    assert near[:43].sum(1).max() < 40
+    assert near[43:].any(1).float().mean() < 0.1
+
+
+def test_no_lines_are_looked_for_between_bands_that_are_far_apart():
+    middle, spread = line_sheet(np.arange(500.0, 751, 25), torch.eye(11, dtype=torch.float64))
+    assert middle.shape == (0, 11)
+    assert spread.shape == (0, 11, 11)
+
+
 def test_expectation_maximisation_finds_planted_clusters():
     random = torch.Generator().manual_seed(0)
     points = torch.randn(3000, 2, generator=random, dtype=torch.float64) * 0.2
@@ -132,20 +164,29 @@ def test_telling_apart_is_the_likelihood_ratio():
     assert found == pytest.approx(expected.sum(), rel=1e-4)
 
 
-def test_coarser_cells_are_weighted_means_of_known_noise():
-    shape = torch.rand(1, 4, 4, 3, generator=torch.Generator().manual_seed(0))
-    noise = 0.1 + torch.rand(1, 4, 4, generator=torch.Generator().manual_seed(1))
-    view = coarser(View(shape, noise, noise))
-    weight = 1 / noise[0, :2, 2:]
-    expected = (shape[0, :2, 2:] * weight[..., None]).sum((0, 1)) / weight.sum()
-    torch.testing.assert_close(view.shape[0, 0, 1], expected)
-    torch.testing.assert_close(view.noise[0, 0, 1], 1 / weight.sum())
+def test_coarser_cells_show_what_most_of_them_show():
+    """Three of four cells of one colour: their weighted mean, as sure as they are together."""
+    camera = Camera(CAMERA.sensitivities, broad_prior().on(CAMERA.wavelength))
+    projected = CAMERA.project(two_colours(8))[0, [0, 7]] @ camera.project
+    one, other = projected[:, :-1] / projected[:, -1:]
+    random = torch.Generator().manual_seed(0)
+    shape = one + 1e-4 * torch.randn(1, 4, 4, 32, generator=random)
+    shape[0, 0, 1] = other
+    noise = 1e-6 * (1 + torch.rand(1, 4, 4, generator=random))
+    view = coarser(View(shape, noise, 2 * torch.ones(1, 4, 4)), camera)
+    weight = 1 / noise
+    weight[0, 0, 1] = 0
+    weight = weight[0, :2, :2, None]
+    expected = (shape[0, :2, :2] * weight).sum((0, 1)) / weight.sum()
+    torch.testing.assert_close(view.shape[0, 0, 0], expected, rtol=0, atol=1e-5)
+    assert float(view.noise[0, 0, 0] * weight.sum()) == pytest.approx(1, rel=0.02)
+    torch.testing.assert_close(view.amplitude, 2 * torch.ones(1, 2, 2))
 
 
 def test_shares_sum_to_one_and_a_flat_picture_stays():
     camera = Camera(CAMERA.sensitivities, broad_prior().on(CAMERA.wavelength))
     fine = View(torch.ones(1, 8, 8, 32), torch.full((1, 8, 8), 0.01), torch.ones(1, 8, 8))
-    kin, alone = kinship(fine, fine, coarser(fine), camera)
+    kin, alone = kinship(fine, fine, coarser(fine, camera), camera)
     torch.testing.assert_close(kin.sum(-1), torch.ones(1, 8, 8))
     assert (alone < 0).all()  # sixteen times more is known of the four together
     coarse = torch.full((1, 4, 4, 3), 2.5)
@@ -157,7 +198,7 @@ def test_each_side_of_an_edge_takes_from_its_own():
     projected = CAMERA.project(two_colours(8))[None] @ camera.project
     amplitude = projected[..., -1]
     fine = View(projected[..., :-1] / amplitude[..., None], torch.full((1, 8, 8), 1e-3), amplitude)
-    kin, _ = kinship(fine, fine, coarser(fine), camera)
+    kin, _ = kinship(fine, fine, coarser(fine, camera), camera)
     label = (torch.arange(4) >= 2).float().expand(1, 4, -1)[..., None]
     mixed = inherit(kin, label.contiguous())[0, ..., 0]
     assert (mixed[:, :4] < 1e-3).all()

@@ -12,6 +12,7 @@ from squilla.errors import InputError
 from squilla.priors import natural_spectra
 from squilla.reconstruction import compiled, engine, evidence
 from squilla.reconstruction.models import load_model, model_class
+from squilla.reconstruction.posteriors import CompiledCamera
 from squilla.training.noise import add_noise
 
 CAMERA = smooth_camera(0, filters=20, bands=126)
@@ -68,7 +69,7 @@ def test_compiled_loops_are_the_tensors_they_stand_for(camera, threads):
         noise = torch.nn.functional.pad(ratio[None] * factor, (0, 14, 0, 11), value=torch.inf)
         places = None if zone is None else torch.nn.functional.pad(zone[None], (0, 14, 0, 11))
         expected = evidence.gather_evidence(padded, noise, front, evidence.LEVELS, places)
-    matrices = compiled.CompiledCamera(front)
+    matrices = CompiledCamera(front)
     own = compiled.noise_factor(y.numpy(), ratio.numpy(), matrices, threads)
     assert own == pytest.approx(float(factor), rel=1e-4)
     place = None if zone is None else zone.numpy()

@@ -28,7 +28,9 @@ def reconstruct(
     ] = False,
     engine: Annotated[
         str | None,
-        typer.Option(help="Runs the networks: torch, openvino, openvino-bf16, onnxruntime, cuda."),
+        typer.Option(
+            help="Runs the networks: torch, openvino, openvino-bf16, onnxruntime, cuda, cuda-bf16."
+        ),
     ] = None,
     interval: Annotated[
         bool, typer.Option("--interval", help="Save how far it may be off, 90 %: `compound`.")

@@ -106,7 +106,8 @@ def blue_shift(
     Raises
     ------
     InputError
-        If the effective index is below 1, or `onto` reaches beyond `wavelength`.
+        If the effective index is below 1, `onto` reaches beyond `wavelength`, or the cones have
+        other numbers of points.
 
     Source: the module's. What a cone on the axis has shifted and blurred already is counted once:
     the shifts left, point by point of the pupil, are those between the two cones, whose mean and
@@ -121,6 +122,11 @@ def blue_shift(
         raise InputError(
             f"The filter table covers {first:g}-{last:g} nm, but {onto.min():g}-{onto.max():g} nm "
             "is needed; nothing is extrapolated."
+        )
+    if np.shape(measured_in[0]) not in (np.shape(cone[0]), (1,), ()):
+        raise InputError(
+            f"The cones have {np.size(measured_in[0])} and {np.size(cone[0])} points of the pupil; "
+            "the response must have been measured in as many as it is seen in, or in one."
         )
     here, there = (
         1 - (np.sin(np.asarray(angles, float)) / effective_index) ** 2

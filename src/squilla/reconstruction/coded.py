@@ -1,6 +1,6 @@
 """The back end of the compound model on a processor, and spectra worked out only where asked.
 
-`compound.BackEnd` says what is computed. Here its three networks are left to an engine, and the
+`back_end.BackEnd` says what is computed. Here its three networks are left to an engine, and the
 rest runs in loops that pass memory once. What comes out stays in coefficients until somebody wants
 bands, spectra or the whole cube.
 """
@@ -13,16 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from squilla.reconstruction.compiled import (
-    ONE,
-    compiled,
-    inherited,
-    over_rows,
-    sigmoid,
-    times,
-)
+from squilla.reconstruction.compiled import inherited
 from squilla.reconstruction.engine import Network
 from squilla.reconstruction.evidence import CORRECTED, SPECTRAL, Evidence
+from squilla.reconstruction.kernels import ONE, compiled, over_rows, sigmoid, times
 from squilla.threads import single_threaded_products
 
 _CHANGED = CORRECTED[0]
@@ -44,7 +38,7 @@ def _clamped(value, most):
 
 @compiled
 def _coarse_inputs(first, last, coefficients, variance, features, scale, inputs):
-    """Write what the network of the coarse cells sees; see `compound.BackEnd`."""
+    """Write what the network of the coarse cells sees; see `back_end.BackEnd`."""
     size, ten = scale.size, np.float32(10)
     for row in range(first, last):
         for column in range(inputs.shape[1]):
@@ -179,7 +173,7 @@ class Coded:
 
 
 def refine(seen: Evidence, networks: Sequence[Network], scale: np.ndarray, threads: int) -> Coded:
-    """Do what `compound.BackEnd` does, up to the coefficients, for one picture.
+    """Do what `back_end.BackEnd` does, up to the coefficients, for one picture.
 
     networks : of the coarse cells, of the finest and of those between.
     """

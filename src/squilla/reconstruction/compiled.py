@@ -1,19 +1,14 @@
 """The front end of the compound model on a processor: `evidence` in loops that pass memory once.
 
 The functions of `evidence` say what is computed; these compute it for one picture at a time, in a
-third of the time, and the tests hold both together. Every kernel works on some rows of a picture
-and lets go of the interpreter's lock, so that plain threads share the rows.
+third of the time, and the tests hold both together.
 
 A view is one array, (H, W, 2 + D): noise variance, amplitude, and the shape in D directions.
 """
 
 import math
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from itertools import pairwise
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -24,46 +19,18 @@ from squilla.reconstruction.evidence import (
     MODEL_NOISE,
     SPECTRAL,
     TOLD,
-    Camera,
     Evidence,
 )
-from squilla.reconstruction.prior import LEADING
+from squilla.reconstruction.kernels import ONE, add_product, compiled, over_rows, sigmoid
+from squilla.reconstruction.posteriors import CompiledCamera, by_zone, mixture, wiener
 from squilla.threads import single_threaded_products
 
-compiled = numba.njit(
-    fastmath={"reassoc", "contract", "nsz", "arcp"},
-    error_model="numpy",
-    nogil=True,
-    cache=True,
-)
-ONE, _HALF, _MODEL = np.float32(1), np.float32(0.5), np.float32(MODEL_NOISE)
+_HALF, _MODEL = np.float32(0.5), np.float32(MODEL_NOISE)
 _ROWS = 16
 """Rows of a picture that are worked on at a time where a step leaves something to the next."""
 
-_LIKELY = np.float32(1e-6)
-"""Clusters less likely than this leave no trace in a posterior."""
-
 
 # --- sums over the channels of a cell -----------------------------------------------------------
-
-
-@compiled
-def add_product(vector, matrix, total):
-    """Add vector @ matrix to `total`; four rows at a time keep the sums in registers."""
-    rows, columns = matrix.shape
-    whole = rows - rows % 4
-    for i in range(0, whole, 4):
-        a, b, c, d = vector[i], vector[i + 1], vector[i + 2], vector[i + 3]
-        for j in range(columns):
-            total[j] += (
-                a * matrix[i, j]
-                + b * matrix[i + 1, j]
-                + c * matrix[i + 2, j]
-                + d * matrix[i + 3, j]
-            )
-    for i in range(whole, rows):
-        for j in range(columns):
-            total[j] += vector[i] * matrix[i, j]
 
 
 @compiled
@@ -87,11 +54,6 @@ def _difference(one, other, scale):
         apart = one[2 + i] - other[2 + i]
         total += apart * apart * scale[i]
     return total
-
-
-@compiled
-def sigmoid(x):
-    return ONE / (ONE + math.exp(-x))
 
 
 # --- from the measurement to views of every level -----------------------------------------------
@@ -180,21 +142,30 @@ def _viewed(first: int, last: int, y: np.ndarray, project: np.ndarray, *argument
 
 
 @compiled
-def _coarser(first, last, fine, view):
+def _coarser(first, last, fine, power, view):
+    scale, share = np.empty(TOLD, np.float32), np.empty((4, 4), np.float32)
     for row in range(first, last):
         for column in range(view.shape[1]):
-            cell, weight = view[row, column], np.float32(0)
-            cell[:] = 0
-            for y in range(2):
-                for x in range(2):
-                    part = fine[2 * row + y, 2 * column + x]
-                    share = ONE / part[0]
-                    weight += share
-                    for i in range(1, cell.size):
-                        cell[i] += share * part[i]
+            parts = (
+                fine[2 * row, 2 * column], fine[2 * row, 2 * column + 1],
+                fine[2 * row + 1, 2 * column], fine[2 * row + 1, 2 * column + 1],
+            )  # fmt: skip
+            for i in range(4):
+                share[i, i] = ONE / parts[i][0]
+                for j in range(i):
+                    against = _telling(parts[i][0] + parts[j][0] + 2 * _MODEL, power, scale)
+                    alike = sigmoid(against - _difference(parts[i], parts[j], scale))
+                    share[i, j], share[j, i] = alike / parts[j][0], alike / parts[i][0]
+            most, certainty = 0, np.float32(0)
+            for i in range(4):
+                total = share[i, 0] + share[i, 1] + share[i, 2] + share[i, 3]
+                if total > certainty:
+                    most, certainty = i, total
+            p, q, r, s = share[most] / certainty
+            cell = view[row, column]
             for i in range(1, cell.size):
-                cell[i] /= weight
-            cell[0] = ONE / weight
+                cell[i] = p * parts[0][i] + q * parts[1][i] + r * parts[2][i] + s * parts[3][i]
+            cell[0] = ONE / certainty
 
 
 @compiled
@@ -284,133 +255,7 @@ def _besides_itself(first, last, alone, known, mixed):
                 cell[i] += itself * (own[i] - cell[i])
 
 
-# --- posteriors ---------------------------------------------------------------------------------
-
-
-@compiled
-def _zoned(first, last, view, zone, matrices, product):
-    """Multiply the shape of every cell by the matrix of its zone: a run of one zone at a time."""
-    width = view.shape[1]
-    shape = np.empty((width, matrices.shape[1]), np.float32)
-    for row in range(first, last):
-        start = 0
-        while start < width:
-            where, stop = zone[row, start], start
-            while stop < width and zone[row, stop] == where:
-                shape[stop] = view[row, stop, 2:]
-                stop += 1
-            np.dot(shape[start:stop], matrices[where], product[row][start:stop])
-            start = stop
-
-
-@compiled
-def _wiener(first, last, view, zone, vectors, power, gain, own):
-    """Write the linear estimate of `Estimators.wiener`, as many coefficients as `own` has."""
-    score = np.empty((1, view.shape[1], vectors.shape[2]), np.float32)
-    for row in range(first, last):
-        here, places = view[row : row + 1], zone[row : row + 1]
-        _zoned(0, 1, here, places, vectors, score)
-        start = 0
-        while start < view.shape[1]:
-            where, stop = zone[row, start], start
-            while stop < view.shape[1] and zone[row, stop] == where:
-                cell, noise = score[0, stop], view[row, stop, 0] + _MODEL
-                for i in range(cell.size):
-                    cell[i] /= power[where, i] + noise
-                stop += 1
-            np.dot(score[0][start:stop], gain[where], own[row][start:stop])
-            start = stop
-
-
-@compiled
-def _mixture(
-    first, last, scores, view, zone, offset, power, gain, mean, log_share, within, leading,
-    found, variance, features,
-):  # fmt: skip
-    """Write the posterior of `Estimators.mixture`; clusters without a say are left out."""
-    clusters, directions = power.shape[1:]
-    size, nodes = found.shape[2], log_share.shape[1]
-    scaled = np.empty(directions, np.float32)
-    weight = np.empty(clusters, np.float32)
-    each = np.empty((clusters, size), np.float32)
-    for row in range(first, last):
-        for column in range(found.shape[1]):
-            score, where = scores[row, column], zone[row, column]
-            noise = view[row, column, 0] + _MODEL
-            for i in range(score.size):
-                score[i] -= offset[where, i]
-            place = min(max(math.log10(noise) * 2 + 10, 0.0), nodes - 1.0)
-            low = min(int(place), nodes - 2)
-            high = np.float32(place - low)
-            most = np.float32(-np.inf)
-            for k in range(clusters):
-                misfit = np.float32(0)
-                for i in range(directions):
-                    value = score[k * directions + i]
-                    misfit += value * value / (power[where, k, i] + noise)
-                tables = log_share[where]
-                weight[k] = (ONE - high) * tables[low, k] + high * tables[low + 1, k] - misfit / 2
-                most = max(most, weight[k])
-            total = np.float32(0)
-            for k in range(clusters):
-                weight[k] = math.exp(weight[k] - most)
-                total += weight[k]
-            mixed, spread = found[row, column], variance[row, column]
-            mixed[:] = 0
-            spread[:] = 0
-            for k in range(clusters):
-                weight[k] /= total
-                if weight[k] < _LIKELY:
-                    continue
-                for i in range(directions):
-                    scaled[i] = score[k * directions + i] / (power[where, k, i] + noise)
-                each[k] = mean[where, k]
-                add_product(scaled, gain[where, k], each[k])
-                near, far = weight[k] * (ONE - high), weight[k] * high
-                one, other = within[where, low, k], within[where, low + 1, k]
-                for i in range(size):
-                    mixed[i] += weight[k] * each[k, i]
-                    spread[i] += near * one[i] + far * other[i]
-            for k in range(clusters):
-                if weight[k] >= _LIKELY:
-                    for i in range(leading):
-                        apart = each[k, i] - mixed[i]
-                        spread[i] += weight[k] * apart * apart
-            evidence = (most + math.log(total)) / directions
-            features[row, column, 0] = math.log(noise)
-            features[row, column, 1] = min(max(evidence, np.float32(-20)), np.float32(20))
-
-
 # --- all of it ----------------------------------------------------------------------------------
-
-
-class CompiledCamera:
-    """The matrices of a `Camera` as the kernels take them; one set for each zone."""
-
-    def __init__(self, camera: Camera):
-        zones = camera.zones
-        clusters = len(zones[0].cluster_power)
-
-        def stacked(name: str) -> np.ndarray:
-            return np.ascontiguousarray(np.stack([getattr(zone, name) for zone in zones]))
-
-        self.channels = np.float32(camera.channels)
-        self.project = camera.project.numpy()
-        self.flat = np.ascontiguousarray(camera.project[:, -1].numpy())
-        self.quiet, self.power = np.ascontiguousarray(camera.quiet.numpy()), camera.power.numpy()
-        self.vectors, self.spread, gain = map(stacked, ("vectors", "power", "gain"))
-        self.gains = [np.ascontiguousarray(gain[..., :size]) for size in CORRECTED]
-        self.scores = stacked("scores")
-        within = stacked("within")
-        self.mixture = (
-            stacked("offset"),
-            stacked("cluster_power"),
-            stacked("cluster_gain"),
-            stacked("mean"),
-            stacked("log_share"),
-            within.reshape(len(zones), -1, clusters, within.shape[-1]),
-            LEADING,
-        )
 
 
 def light(y: np.ndarray, threads: int) -> np.ndarray:
@@ -458,7 +303,7 @@ def gather_evidence(
     """
     step = 2**LEVELS
     sides = tuple(side + -side % step for side in ratio.shape)
-    size, basis = camera.vectors.shape[1], camera.mixture[2].shape[-1]
+    size, basis = camera.vectors.shape[1], camera.mixture[4].shape[-1]
 
     def run(kernel: Callable[..., None], rows: int, *arguments) -> None:
         over_rows(kernel, rows, threads, *arguments)
@@ -473,7 +318,7 @@ def gather_evidence(
     told = np.float32(factor), np.float32(max(floor, 1e-30)), camera.channels
     run(_viewed, sides[0], y, camera.project, ratio, *told, views[0])
     for level in range(1, LEVELS + 1):
-        run(_coarser, len(views[level]), views[level - 1], views[level])
+        run(_coarser, len(views[level]), views[level - 1], camera.power, views[level])
     known = [views[0]]
     for view in views[1:]:
         known.append(np.empty_like(view))
@@ -497,15 +342,15 @@ def gather_evidence(
     coefficients = empty(SPECTRAL, basis)
     variance, features = np.empty_like(coefficients), empty(SPECTRAL, 2)
     place, scores = places[SPECTRAL], empty(SPECTRAL, camera.scores.shape[-1])
-    run(_zoned, len(spectral), spectral, place, camera.scores, scores)
+    run(by_zone, len(spectral), spectral, place, camera.scores, scores)
     run(
-        _mixture, len(spectral), scores, spectral,
+        mixture, len(spectral), scores, spectral,
         place, *camera.mixture, coefficients, variance, features,
     )  # fmt: skip
     own = [empty(level, CORRECTED[level]) for level in range(SPECTRAL)]
     for level, (view, place) in enumerate(zip(known[:SPECTRAL], places, strict=False)):
         matrices = camera.vectors, camera.spread, camera.gains[level]
-        run(_wiener, len(view), view, place, *matrices, own[level])
+        run(wiener, len(view), view, place, *matrices, own[level])
 
     def pictures(values: Iterable[np.ndarray]) -> list[Tensor]:
         return [torch.from_numpy(value)[None] for value in values]
@@ -533,28 +378,3 @@ def _zones(zone: np.ndarray | None, sides: tuple[int, ...], level: int) -> np.nd
         return np.zeros([side >> level for side in sides], np.int64)
     filled = np.pad(zone, [(0, side - own) for side, own in zip(sides, zone.shape, strict=True)])
     return filled[2**level // 2 :: 2**level, 2**level // 2 :: 2**level]
-
-
-def times(first: int, last: int, picture: np.ndarray, matrix: np.ndarray, product: np.ndarray):
-    """Multiply every cell of some rows by a matrix."""
-    np.matmul(picture[first:last], matrix, out=product[first:last])
-
-
-def over_rows(kernel: Callable[..., None], rows: int, threads: int, *arguments) -> None:
-    """Call a kernel for all rows, shared by threads."""
-    # Twice as many parts as threads, since the machine may have other work; but no small ones.
-    parts = min(rows // 32, 2 * threads)
-    if threads == 1 or parts < 2:
-        kernel(0, rows, *arguments)
-        return
-    edges = [rows * number // parts for number in range(parts + 1)]
-    futures = [
-        _pool(threads).submit(kernel, first, last, *arguments) for first, last in pairwise(edges)
-    ]
-    for future in futures:
-        future.result()
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="squilla-rows")

@@ -108,17 +108,30 @@ class View:
 # --- averaging over what looks the same ---------------------------------------------------------
 
 
-def coarser(view: View) -> View:
-    """Average cells two by two, each weighted by its certainty; sides must be even."""
-    b, h, w, _ = view.shape.shape
+def coarser(view: View, camera: Camera) -> View:
+    """Join cells two by two into one that shows what most of them show; sides must be even.
 
-    def total(values: Tensor) -> Tensor:
-        return values.view(b, h // 2, 2, w // 2, 2, -1).sum((2, 4))
+    On an edge the mean of all four would be a spectrum that nobody shows. So the cell that most of
+    the four agree with is averaged with those that do.
+    """
+    b, h, w, size = view.shape.shape
 
-    weight = 1 / view.noise[..., None]
-    summed = total(weight)
-    amplitude = total(view.amplitude[..., None] * weight) / summed
-    return View(total(view.shape * weight) / summed, 1 / summed[..., 0], amplitude[..., 0])
+    def parts(values: Tensor) -> Tensor:
+        values = values.view(b, h // 2, 2, w // 2, 2, -1).transpose(2, 3)
+        return values.reshape(b, h // 2, w // 2, 4, -1)
+
+    joined = parts(torch.cat([view.shape, view.amplitude[..., None]], -1))
+    noise = parts(view.noise)[..., 0]
+    told = joined[..., :TOLD]
+    both = noise[..., :, None] + noise[..., None, :] + 2 * MODEL_NOISE
+    scale, against = _telling(both, camera)
+    differ = ((told[..., :, None, :] - told[..., None, :, :]).square() * scale).sum(-1)
+    itself = torch.eye(4, dtype=torch.bool, device=noise.device)
+    share = torch.sigmoid(against - differ).masked_fill(itself, 1.0) / noise[..., None, :]
+    certainty, most = share.sum(-1).max(-1)
+    share = share.gather(-2, most[..., None, None].expand(*most.shape, 1, 4))
+    mean = (share @ joined)[..., 0, :] / certainty[..., None]
+    return View(mean[..., :size], 1 / certainty, mean[..., size])
 
 
 def among_neighbours(view: View, camera: Camera) -> View:
@@ -286,7 +299,7 @@ def gather_evidence(
     power = shape.square().sum(-1) / camera.channels
     views = [View(shape, (ratio * power.clamp_min(1e-6)).clamp(1e-9, 1e6), amplitude)]
     for _ in range(levels):
-        views.append(coarser(views[-1]))
+        views.append(coarser(views[-1], camera))
     known = [views[0], *(among_neighbours(view, camera) for view in views[1:])]
     lowest = min(SPECTRAL, levels)
     best = spectral = known[-1]

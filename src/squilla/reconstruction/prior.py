@@ -1,13 +1,16 @@
 """What spectra look like before one is measured: a basis, and a mixture of Gaussians in it.
 
 Every spectrum is described by its shape, the spectrum divided by its mean over the bands, in the
-leading principal components of the broad prior. Shapes of natural things, of mixtures of Gaussian
-lines and of single lines lie in clusters; each cluster is a mean and a covariance. So whatever is
-linear in the spectrum, such as the measurement of any camera, has a posterior in closed form.
+leading principal components of the broad prior. Shapes of natural things, of mixtures of Gaussians
+and of lines lie in clusters; each cluster is a mean and a covariance. So whatever is linear in the
+spectrum, such as the measurement of any camera, has a posterior in closed form.
+
+Single lines lie on a curved sheet, of centre and width, that no few Gaussians follow. It is cut
+into pieces so small that each is nearly flat; a piece counts where a measurement comes near it.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files as package_files
 
@@ -21,6 +24,12 @@ from squilla.spectra import resample
 STORED = "weights.prior_"
 """How the prior's tensors are named in a model file."""
 
+SINGLE_LINES = 0.05
+"""Share of spectra that show one line and nothing else."""
+
+CENTRES, WIDTHS, WIDEST = 80, 5, 30.0
+"""Pieces of the sheet of lines along centre and width, and the largest FWHM, nm."""
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -33,6 +42,8 @@ class Prior:
     share : (G,) of each cluster, sums to 1.
     mean : (G, C).
     covariance : (G, C, C).
+    learnt : how many clusters, the first, were learnt from examples; the others are pieces of the
+        sheet of single lines.
     All float64.
     """
 
@@ -42,6 +53,7 @@ class Prior:
     share: Tensor
     mean: Tensor
     covariance: Tensor
+    learnt: int
 
     def on(self, wavelength: np.ndarray) -> "Prior":
         """Return the prior on another grid.
@@ -51,20 +63,19 @@ class Prior:
         """
         at = np.clip(within_tables(wavelength), self.wavelength[0], self.wavelength[-1])
         basis = resample(self.basis.numpy().T, self.wavelength, at).T
-        return Prior(
-            wavelength, torch.from_numpy(basis), self.moment, self.share, self.mean, self.covariance
-        )
+        return replace(self, wavelength=wavelength, basis=torch.from_numpy(basis))
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the numbers for a file; the covariances as their halves below the diagonal."""
+        """Return what was learnt for a file; the covariances as their halves below the diagonal."""
         row, column = torch.tril_indices(*self.moment.shape)
+        own = slice(self.learnt)
         return {
             "wavelength": torch.from_numpy(np.asarray(self.wavelength, np.float32)),
             "basis": self.basis.float(),
             "moment": self.moment.float(),
-            "share": self.share.float(),
-            "mean": self.mean.float(),
-            "covariance": self.covariance[:, row, column].float(),
+            "share": (self.share[own] / self.share[own].sum()).float(),
+            "mean": self.mean[own].float(),
+            "covariance": self.covariance[own, row, column].float(),
         }
 
     @classmethod
@@ -78,7 +89,30 @@ class Prior:
         covariance = moment.new_zeros(len(share), *moment.shape)
         covariance[:, row, column] = half
         covariance[:, column, row] = half
-        return cls(wavelength, basis, moment, share / share.sum(), mean, covariance)
+        return cls.with_lines(wavelength, basis, moment, share / share.sum(), mean, covariance)
+
+    @classmethod
+    def with_lines(
+        cls,
+        wavelength: np.ndarray,
+        basis: Tensor,
+        moment: Tensor,
+        share: Tensor,
+        mean: Tensor,
+        covariance: Tensor,
+    ) -> "Prior":
+        """Add the sheet of single lines to what was learnt."""
+        middle, spread = line_sheet(wavelength, basis)
+        each = torch.full((len(middle),), SINGLE_LINES / max(len(middle), 1), dtype=share.dtype)
+        return cls(
+            wavelength,
+            basis,
+            moment,
+            torch.cat([share * (1 - each.sum()), each]),
+            torch.cat([mean, middle]),
+            torch.cat([covariance, spread]),
+            len(share),
+        )
 
 
 @cache
@@ -107,7 +141,7 @@ def fit_prior(
         Size of the basis, C.
     """
     everything = torch.cat([spectra for spectra, _ in families.values()]).double()
-    basis = torch.linalg.eigh(everything.T @ everything)[1].flip(1)[:, :components]
+    basis = torch.linalg.eigh(everything.T @ everything)[1].flip(1)[:, :components].contiguous()
     peaked = everything @ basis
     share, mean, covariance = [], [], []
     for spectra, clusters in families.values():
@@ -116,7 +150,7 @@ def fit_prior(
         share.append(parts[0] * len(spectra) / len(everything))
         mean.append(parts[1])
         covariance.append(parts[2])
-    return Prior(
+    return Prior.with_lines(
         wavelength,
         basis,
         peaked.T @ peaked * (len(basis) / peaked.square().sum()),
@@ -124,6 +158,31 @@ def fit_prior(
         torch.cat(mean),
         torch.cat(covariance),
     )
+
+
+def line_sheet(wavelength: np.ndarray, basis: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean (G, C) and covariance (G, C, C) of the shapes of single lines, piece by piece.
+
+    Lines of every centre in the band, and of every width (FWHM) from two bands to `WIDEST` nm; none
+    where the bands are too far apart to show them.
+    """
+    finest = 2 * float(np.diff(wavelength).max())
+    if finest >= WIDEST:
+        empty = basis.new_zeros(0, basis.shape[1])
+        return empty, empty[:, :, None] * empty[:, None]
+    inside = (np.arange(7) + 0.5) / 7
+    band = wavelength[-1] - wavelength[0]
+    centre = wavelength[0] + band * (np.arange(CENTRES)[:, None] + inside) / CENTRES
+    width = finest * (WIDEST / finest) ** ((np.arange(WIDTHS)[:, None] + inside) / WIDTHS)
+    away = (wavelength - centre[:, None, :, None, None]) / width[:, None, :, None]
+    spectra = torch.from_numpy(np.exp(-4 * np.log(2) * away**2))  # (CENTRES, WIDTHS, 7, 7, K)
+    shape = (spectra / spectra.mean(-1, keepdim=True)) @ basis
+    shape = shape.flatten(2, 3).flatten(0, 1)
+    mean = shape.mean(1)
+    offset = shape - mean[:, None]
+    spread = offset.mT @ offset / offset.shape[1]
+    ridge = 1e-6 * mean.square().mean()
+    return mean, spread + ridge * torch.eye(basis.shape[1], dtype=basis.dtype)
 
 
 def fit_mixture(points: Tensor, clusters: int, *, rounds: int = 40) -> tuple[Tensor, ...]:
@@ -179,6 +238,9 @@ def fit_mixture(points: Tensor, clusters: int, *, rounds: int = 40) -> tuple[Ten
 LEADING = 16
 """Coefficients for which the clusters' disagreement counts in the variance."""
 
+_WITHIN, BEYOND = 5.0, 3.0
+"""How far from its middle a piece of the sheet reaches, in its own variance, and in the noise's."""
+
 _NODES = torch.arange(13)
 """Noise variances between which tables are interpolated: 10^-5 to 10, two to a decade."""
 
@@ -215,13 +277,20 @@ class Estimators:
         self.mean = mean.float()
         self.cluster_power = power.float()
         self.cluster_gain = gain.float()
-        self.scores = vectors.permute(1, 0, 2).flatten(1).float()  # (D, G D)
-        self.offset = torch.einsum("gd,gde->ge", mean @ seen.T, vectors).flatten().float()
+        self.scores = vectors.transpose(0, 1).float()  # (D, G, D)
+        self.offset = torch.einsum("gd,gde->ge", mean @ seen.T, vectors).float()  # (G, D)
         total = power + 10 ** (_NODES.double() / 2 - 5)[:, None, None]  # (J, G, D)
         self.log_share = (prior.share.log() - total.log().sum(-1) / 2).float()  # (J, G)
+        self.learnt = prior.learnt
+        piece = slice(prior.learnt, None)
+        middle = mean[piece] @ seen.T
+        middle = middle / middle.norm(dim=1, keepdim=True)  # (L, D)
+        beside = 1 - torch.einsum("gd,gde->ge", middle, vectors[piece]).square()
+        self.middle = middle.T.contiguous().float()  # (D, L)
+        self.reach = _WITHIN * (power[piece] * beside).sum(-1).float()  # (L,)
         prior_variance = covariance.diagonal(dim1=-2, dim2=-1)
         within = prior_variance - torch.einsum("jgd,gdc->jgc", 1 / total, gain.square())
-        self.within = within.clamp_min(1e-10).flatten(0, 1).float()  # (J G, C)
+        self.within = within.clamp_min(1e-10).float()  # (J, G, C)
         self.power, self.vectors, self.gain = (
             value.float() for value in (self.power, self.vectors, self.gain)
         )
@@ -229,7 +298,8 @@ class Estimators:
     def to(self, device: torch.device | str) -> "Estimators":
         """Move all matrices to a device, in place."""
         for name, value in vars(self).items():
-            setattr(self, name, value.to(device))
+            if isinstance(value, Tensor):
+                setattr(self, name, value.to(device))
         return self
 
     def mixture(self, shape: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -246,18 +316,44 @@ class Estimators:
         -------
         mean (N, C), variance (N, C), log evidence (N,) per direction
         """
-        count, (clusters, size) = len(shape), self.cluster_power.shape
-        score = (shape @ self.scores - self.offset).view(count, clusters, size)
-        scaled = score / (self.cluster_power + noise[:, None, None])
+        near = self.near(shape, noise)
+        if shape.is_cuda:  # without asking how many, so that it can be recorded
+            return self._posterior(shape, noise, near)
+        some = near.any(1)
+        if not some.any():
+            return self._posterior(shape, noise, None)
+        mean, variance, evidence = self._posterior(shape, noise, None)
+        mean[some], variance[some], evidence[some] = self._posterior(
+            shape[some], noise[some], near[some]
+        )
+        return mean, variance, evidence
+
+    def near(self, shape: Tensor, noise: Tensor) -> Tensor:
+        """Return which pieces of the sheet each shape comes near, (N, L)."""
+        beside = shape.square().sum(1, keepdim=True) - (shape @ self.middle).square()
+        return beside <= self.reach + BEYOND * shape.shape[1] * noise[:, None]
+
+    def _posterior(
+        self, shape: Tensor, noise: Tensor, near: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Do what `mixture` says, by what was learnt alone or by the pieces that are near too."""
+        count, size = shape.shape
+        own = slice(self.learnt if near is None else None)
+        scores, offset = self.scores[:, own].flatten(1), self.offset[own].flatten()
+        score = (shape @ scores - offset).view(count, -1, size)
+        scaled = score / (self.cluster_power[own] + noise[:, None, None])
         place = (noise.log10() * 2 + 10).clamp(0, len(_NODES) - 1)
         node = torch.relu(1 - (place[:, None] - _NODES.to(noise.device)).abs())  # (N, J)
-        logs = node @ self.log_share - (score * scaled).sum(-1) / 2
+        logs = node @ self.log_share[:, own] - (score * scaled).sum(-1) / 2
+        if near is not None:
+            logs[:, self.learnt :].masked_fill_(~near, -torch.inf)
         weight = torch.softmax(logs, 1)
-        each = torch.bmm(scaled.transpose(0, 1), self.cluster_gain[..., :LEADING])
-        each = each.transpose(0, 1) + self.mean[:, :LEADING]
+        gain, middle, within = self.cluster_gain[own], self.mean[own], self.within[:, own]
+        each = torch.bmm(scaled.transpose(0, 1), gain[..., :LEADING])
+        each = each.transpose(0, 1) + middle[:, :LEADING]
         scaled = (scaled * weight[..., None]).flatten(1)
-        mean = torch.addmm(weight @ self.mean, scaled, self.cluster_gain.flatten(0, 1))
-        variance = (node[:, :, None] * weight[:, None]).flatten(1) @ self.within
+        mean = torch.addmm(weight @ middle, scaled, gain.flatten(0, 1))
+        variance = (node[:, :, None] * weight[:, None]).flatten(1) @ within.flatten(0, 1)
         apart = (each - mean[:, None, :LEADING]).square()
         variance[:, :LEADING] += (weight[:, None] @ apart)[:, 0]
         return mean, variance, torch.logsumexp(logs, 1) / size

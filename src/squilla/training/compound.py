@@ -18,7 +18,8 @@ from torch.nn import functional
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.files.disk import replacing
-from squilla.reconstruction.compound import ZONES, BackEnd, Compound
+from squilla.reconstruction.back_end import BackEnd
+from squilla.reconstruction.compound import ZONES, Compound
 from squilla.reconstruction.evidence import (
     CORRECTED,
     LEVELS,
@@ -54,7 +55,7 @@ AVERAGED = 0.998
 
 @dataclass(frozen=True)
 class Recipe:
-    """Settings of a training; the defaults take 40 minutes of one core.
+    """Settings of a training; the defaults take half an hour of two cores.
 
     steps : of the optimiser.
     scenes : in each step.  cameras : that see them.
@@ -62,7 +63,7 @@ class Recipe:
     learning_rate : at its highest; it rises over 100 steps and falls along half a cosine.
     """
 
-    steps: int = 4000
+    steps: int = 1500
     scenes: int = 8
     cameras: int = 4
     arrays: int = 400
@@ -70,16 +71,16 @@ class Recipe:
     seed: int = 0
 
 
-def learn_prior(wavelength: np.ndarray, *, count: int = 30_000, seed: int = 0) -> Prior:
+def learn_prior(wavelength: np.ndarray, *, count: int = 60_000, seed: int = 0) -> Prior:
     """Learn the prior of `Compound` on a grid, from spectra that the palette paints with."""
     palette = Palette(wavelength, seed=seed, count=round(0.25 * count))
     generator = Generator().manual_seed(seed)
     lamp = (torch.rand(round(0.6 * count), generator=generator) * len(palette.lamp)).long()
     natural = palette.natural(lamp, generator)
     families = {
-        "natural": (natural / natural.amax(-1, keepdim=True), 14),
-        "gaussian": (palette.gaussian, 6),
-        "line": (palette.line[: round(0.15 * count)], 6),
+        "natural": (natural / natural.amax(-1, keepdim=True), 28),
+        "gaussian": (palette.gaussian, 10),
+        "line": (palette.line[: round(0.15 * count)], 10),
     }
     return fit_prior(families, wavelength)
 

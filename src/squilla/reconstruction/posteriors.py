@@ -1,0 +1,164 @@
+"""Posteriors of the compound model on a processor: what `prior.Estimators` says, cell by cell.
+
+A view is one array, (H, W, 2 + D): noise variance, amplitude, and the shape in D directions.
+"""
+
+import math
+
+import numpy as np
+
+from squilla.reconstruction.evidence import CORRECTED, MODEL_NOISE, Camera
+from squilla.reconstruction.kernels import ONE, add_product, compiled
+from squilla.reconstruction.prior import BEYOND, LEADING
+
+_MODEL, _BEYOND = np.float32(MODEL_NOISE), np.float32(BEYOND)
+
+_LIKELY = np.float32(1e-6)
+"""Clusters less likely than this leave no trace in a posterior."""
+
+
+class CompiledCamera:
+    """The matrices of a `Camera` as the kernels take them; one set for each zone."""
+
+    def __init__(self, camera: Camera):
+        zones = camera.zones
+
+        def stacked(name: str) -> np.ndarray:
+            return np.ascontiguousarray(np.stack([getattr(zone, name) for zone in zones]))
+
+        self.channels = np.float32(camera.channels)
+        self.project = camera.project.numpy()
+        self.flat = np.ascontiguousarray(camera.project[:, -1].numpy())
+        self.quiet, self.power = np.ascontiguousarray(camera.quiet.numpy()), camera.power.numpy()
+        self.vectors, self.spread, gain = map(stacked, ("vectors", "power", "gain"))
+        self.gains = [np.ascontiguousarray(gain[..., :size]) for size in CORRECTED]
+        learnt, scores = zones[0].learnt, stacked("scores")  # (Z, D, G, D)
+        known = scores[:, :, :learnt].reshape(*scores.shape[:2], -1)
+        self.scores = np.concatenate([known, stacked("middle")], -1)
+        self.mixture = (
+            np.ascontiguousarray(scores[:, :, learnt:].swapaxes(1, 2)),
+            stacked("reach"),
+            stacked("offset"),
+            stacked("cluster_power"),
+            stacked("cluster_gain"),
+            stacked("mean"),
+            stacked("log_share"),
+            stacked("within"),
+            LEADING,
+        )
+
+
+@compiled
+def by_zone(first, last, view, zone, matrices, product):
+    """Multiply the shape of every cell by the matrix of its zone: a run of one zone at a time."""
+    width = view.shape[1]
+    shape = np.empty((width, matrices.shape[1]), np.float32)
+    for row in range(first, last):
+        start = 0
+        while start < width:
+            where, stop = zone[row, start], start
+            while stop < width and zone[row, stop] == where:
+                shape[stop] = view[row, stop, 2:]
+                stop += 1
+            np.dot(shape[start:stop], matrices[where], product[row][start:stop])
+            start = stop
+
+
+@compiled
+def wiener(first, last, view, zone, vectors, power, gain, own):
+    """Write the linear estimate of `Estimators.wiener`, as many coefficients as `own` has."""
+    score = np.empty((1, view.shape[1], vectors.shape[2]), np.float32)
+    for row in range(first, last):
+        here, places = view[row : row + 1], zone[row : row + 1]
+        by_zone(0, 1, here, places, vectors, score)
+        start = 0
+        while start < view.shape[1]:
+            where, stop = zone[row, start], start
+            while stop < view.shape[1] and zone[row, stop] == where:
+                cell, noise = score[0, stop], view[row, stop, 0] + _MODEL
+                for i in range(cell.size):
+                    cell[i] /= power[where, i] + noise
+                stop += 1
+            np.dot(score[0][start:stop], gain[where], own[row][start:stop])
+            start = stop
+
+
+@compiled
+def mixture(
+    first, last, scores, view, zone, pieces, reach, offset, power, gain, mean, log_share, within,
+    leading, found, variance, features,
+):  # fmt: skip
+    """Write the posterior of `Estimators.mixture`; clusters without a say are left out.
+
+    scores : of every cell, by what was learnt, and how far it goes along the middle of each piece.
+    """
+    clusters, directions = power.shape[1:]
+    size, nodes, learnt = found.shape[2], log_share.shape[1], clusters - reach.shape[1]
+    scaled = np.empty(directions, np.float32)
+    score = np.empty((clusters, directions), np.float32)
+    each = np.empty((clusters, size), np.float32)
+    weight = np.empty(clusters, np.float32)
+    likely = np.empty(clusters, np.int64)
+    for row in range(first, last):
+        for column in range(found.shape[1]):
+            seen, where, cell = scores[row, column], zone[row, column], view[row, column, 2:]
+            noise = view[row, column, 0] + _MODEL
+            count = learnt
+            for k in range(learnt):
+                likely[k] = k
+                own, shift = score[k], offset[where, k]
+                for i in range(directions):
+                    own[i] = seen[k * directions + i] - shift[i]
+            beside, closest = -_BEYOND * np.float32(directions) * noise, np.float32(-np.inf)
+            for i in range(directions):
+                beside += cell[i] * cell[i]
+            along, wide = seen[learnt * directions :], reach[where]
+            for piece in range(wide.size):
+                closest = max(closest, along[piece] * along[piece] + wide[piece])
+            if closest >= beside:
+                for piece in range(wide.size):
+                    if along[piece] * along[piece] + wide[piece] >= beside:
+                        k = learnt + piece
+                        likely[count] = k
+                        count += 1
+                        score[k] = -offset[where, k]
+                        add_product(cell, pieces[where, piece], score[k])
+            place = min(max(math.log10(noise) * 2 + 10, 0.0), nodes - 1.0)
+            low = min(int(place), nodes - 2)
+            high = np.float32(place - low)
+            tables, most = log_share[where], np.float32(-np.inf)
+            for k in likely[:count]:
+                misfit, own, known = np.float32(0), score[k], power[where, k]
+                for i in range(directions):
+                    misfit += own[i] * own[i] / (known[i] + noise)
+                weight[k] = (ONE - high) * tables[low, k] + high * tables[low + 1, k] - misfit / 2
+                most = max(most, weight[k])
+            total = np.float32(0)
+            for k in likely[:count]:
+                weight[k] = math.exp(weight[k] - most)
+                total += weight[k]
+            mixed, spread = found[row, column], variance[row, column]
+            mixed[:] = 0
+            spread[:] = 0
+            for k in likely[:count]:
+                weight[k] /= total
+                if weight[k] < _LIKELY:
+                    continue
+                own, known = score[k], power[where, k]
+                for i in range(directions):
+                    scaled[i] = own[i] / (known[i] + noise)
+                each[k] = mean[where, k]
+                add_product(scaled, gain[where, k], each[k])
+                near, far = weight[k] * (ONE - high), weight[k] * high
+                one, other = within[where, low, k], within[where, low + 1, k]
+                for i in range(size):
+                    mixed[i] += weight[k] * each[k, i]
+                    spread[i] += near * one[i] + far * other[i]
+            for k in likely[:count]:
+                if weight[k] >= _LIKELY:
+                    for i in range(leading):
+                        apart = each[k, i] - mixed[i]
+                        spread[i] += weight[k] * apart * apart
+            evidence = (most + math.log(total)) / directions
+            features[row, column, 0] = math.log(noise)
+            features[row, column, 1] = min(max(evidence, np.float32(-20)), np.float32(20))
