@@ -313,7 +313,8 @@ def render() -> None:
     few.insert(at, {"row": "ten unseen arrays, chart 20 dB, mean", **mean})
     own = [name for name in rows[0] if name.endswith("_0")]  # cells of table 5.1
     names = {"ridge": "ridge", "sparse": "sparse", "mlp": "mlp"}
-    names |= {name: name.split("_")[0] for name in own} | {"compound": "compound"}
+    names |= {name: name.split("_")[0] + ", broad" * ("broad" in name) for name in own}
+    names["compound"] = "compound"
     heads = [f"*{head}*" if name in own else head for name, head in names.items()]
     lines = [["row", *heads, "SAM", "PSNR", "cover"], ["---"] * (len(names) + 4)]
     for row in few:

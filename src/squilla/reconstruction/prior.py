@@ -317,7 +317,7 @@ class Estimators:
         mean (N, C), variance (N, C), log evidence (N,) per direction
         """
         near = self.near(shape, noise)
-        if shape.is_cuda:  # without asking how many, so that it can be recorded
+        if shape.device.type != "cpu":  # without asking how many, so that it can be recorded
             return self._posterior(shape, noise, near)
         some = near.any(1)
         if not some.any():
