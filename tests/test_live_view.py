@@ -107,7 +107,9 @@ def test_what_was_asked_of_a_frame_is_expected_of_the_next(live):
     shown = live.now()
 
     def frame(before: LiveFrame | None) -> LiveFrame:
-        return LiveFrame(9, shown._measurement, shown._model, {"stages": {}}, nullcontext(), before)
+        return LiveFrame(
+            9, shown._measurement, shown._model, {"stages": {}}, nullcontext(), dict, before
+        )
 
     def band(frame: LiveFrame, number: int) -> None:
         frame.picture(Picture(kind="band", band=number))
@@ -133,7 +135,9 @@ def reads(source: LiveSource, count: int) -> None:
 
 def test_freeze_and_step(live):
     until(lambda: live.now().number >= 3)
+    shown = live.now()
     live.control("frozen", True)
+    assert shown.status()["frozen"]  # also of a frame that was measured before
     reads(live, 2)
     number = live.now().number
     reads(live, 10)

@@ -29,6 +29,9 @@ class LiveFrame(Answers):
         What the page shows of the frame; the time of reconstruction is added.
     turn : context manager
         Entered while reconstructing, where that must not go on beside other work.
+    switches : callable
+        Tells how what the page can set stands, now: a frame that was measured before it was
+        changed may be shown after.
     before : LiveFrame, optional
         What was asked of the frame before is expected to be asked of this one too.
     """
@@ -42,13 +45,14 @@ class LiveFrame(Answers):
         model: Reconstructor,
         told: dict[str, Any],
         turn: AbstractContextManager,
+        switches: Callable[[], dict[str, Any]],
         before: "LiveFrame | None" = None,
     ):
         rows, columns, filters = measurement.y.shape
         seen = counted(measurement.y, measurement.valid) == filters
         valid = DataArray(seen.numpy(), dims=("y", "x"))
         super().__init__("live", (rows, columns), np.asarray(model.wavelength), {"valid": valid})
-        self.number, self._told, self._turn = number, told, turn
+        self.number, self._told, self._turn, self._switches = number, told, turn, switches
         self._model, self._measurement = model, measurement
         self._looked: Reconstruction | None = None
         self._expected = [] if before is None else before._asked or before._expected
@@ -57,13 +61,13 @@ class LiveFrame(Answers):
         self._planes: list[np.ndarray] = []
 
     def status(self) -> dict[str, Any]:
-        """Return exposure, saturation, alignment, the times of the stages."""
-        return self._told
+        """Return exposure, saturation, alignment, the times of the stages, how switches stand."""
+        return self._switches() | self._told
 
-    def again(self, number: int, told: dict[str, Any]) -> "LiveFrame":
-        """Return the same picture as another frame, of which other things are told."""
+    def again(self, number: int, trouble: str) -> "LiveFrame":
+        """Return the same picture as another frame, of which a trouble is told."""
         other = copy(self)
-        other.number, other._told = number, told
+        other.number, other._told = number, self._told | {"error": trouble}
         return other
 
     def cube(self) -> DataArray:

@@ -215,7 +215,9 @@ class LiveSource:
             "stages": {"frame": 1000 * taken, "measure": 1000 * spent},
         }
         self._number += 1
-        frame = LiveFrame(self._number, measurement, self._model, told, self._turn, self._frame)
+        frame = LiveFrame(
+            self._number, measurement, self._model, told, self._turn, self._switches, self._frame
+        )
         if self._recorder is not None and self._recorder.running:
             self._recorder.offer(raw, frame.cube)
         self._frame = frame
@@ -231,7 +233,7 @@ class LiveSource:
         counts, times = self._source.statistics, self._times
         rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else None
         few = raw.frame[::8, ::8]
-        return self._switches() | {
+        return {
             "rate": rate,
             "dropped": counts.skipped + counts.lost,
             "incomplete": counts.incomplete,
@@ -277,6 +279,6 @@ class LiveSource:
         last = self._frame
         if trouble != self._trouble and last is not None:
             self._number += 1
-            self._frame = last.again(self._number, last.status() | {"error": trouble})
+            self._frame = last.again(self._number, trouble)
         self._trouble = trouble
         self._first.set()
