@@ -45,7 +45,7 @@ class Ridge(Reconstructor):
     """
 
     name = "ridge"
-    piece = 1 << 16
+    piece = 8192
     basis: Tensor
     power: Tensor
     gain: Tensor
@@ -90,9 +90,9 @@ class Ridge(Reconstructor):
         basis = torch.cat([self.basis[:-2], self.basis[1:-1]], -1)
         return basis, torch.cat([self.gain[:-2], self.gain[1:-1]], -2)
 
-    def _piece(self, y: Tensor, angle: Tensor | None, snr: Tensor | None, scale: Scale) -> Tensor:
+    def _whole(self, y: Tensor, angle: Tensor | None, snr: Tensor | None, scale: Scale) -> Tensor:
         if angle is None or y.device.type != "cpu":
-            return super()._piece(y, angle, snr, scale)
+            return super()._whole(y, angle, snr, scale)
         node = np.square(self.calibration.angle).astype(np.float32)
         x = torch.empty(len(y), self.gain.shape[-1])
         noise = _noise_to_signal(snr, len(y), y.device)

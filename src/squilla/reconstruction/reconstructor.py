@@ -116,16 +116,18 @@ class Reconstructor(nn.Module):
         if y.numel() == 0:
             return y.new_zeros(*pixels, len(self.wavelength))
         y = y.reshape(-1, y.shape[-1])
+        angle, snr = (None if each is None else each.reshape(-1) for each in (angle, snr))
+        return self._whole(y, angle, snr, scale).reshape(*pixels, len(self.wavelength))
+
+    def _whole(self, y: Tensor, angle: Tensor | None, snr: Tensor | None, scale: Scale) -> Tensor:
+        """Work through pixels, (N, M), in pieces."""
         # A GPU has to be filled; threads of an engine and of PyTorch should not take short turns.
         alone = y.device.type == "cpu" and self._network is None
         piece = self.piece * (1 if alone else 32)
-        told = [
-            repeat(None) if each is None else each.reshape(-1).split(piece) for each in (angle, snr)
-        ]
+        told = [repeat(None) if each is None else each.split(piece) for each in (angle, snr)]
         each = zip(y.split(piece), *told, strict=False)
         parts = [self._piece(some, place, ratio, scale) for some, place, ratio in each]
-        x = torch.cat(parts) if len(parts) > 1 else parts[0]
-        return x.reshape(*pixels, len(self.wavelength))
+        return torch.cat(parts) if len(parts) > 1 else parts[0]
 
     def _piece(self, y: Tensor, angle: Tensor | None, snr: Tensor | None, scale: Scale) -> Tensor:
         finite = y.sum(-1, keepdim=True).isfinite()
