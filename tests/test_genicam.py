@@ -238,17 +238,25 @@ def test_neither_memory_nor_threads_grow(twin):
 def test_an_interrupt_is_heard(twin):
     with open_camera(HERE) as camera:
         camera.trigger = "Software"
-        connection, waiting = camera._connection, threading.Event()
+        connection, waiting, heard = camera._connection, threading.Event(), threading.Event()
         receive = connection.receive
         connection.receive = lambda timeout: (waiting.set(), receive(timeout))[1]
 
         def interrupt():
             waiting.wait(60)
             _thread.interrupt_main()
+            while not heard.wait(10):  # as a person does whom nothing answers
+                _thread.interrupt_main()
+
+        def read():
+            try:
+                camera.read(timeout=60)
+            finally:
+                heard.set()
 
         threading.Thread(target=interrupt).start()
         with pytest.raises(KeyboardInterrupt):  # and not, at last, that no frame came
-            camera.read(timeout=60)
+            read()
 
 
 # --- what a person gets wrong -----------------------------------------------------------------

@@ -99,8 +99,9 @@ def test_from_the_wire_to_the_page(opened, twin, frames, calibration):
 
         wish(name="gain", value=6.0)
         wish(name="exposure", value=good / 3)
-        until(line, lambda told: told["gain"] == 6.0 and told["exposure"] == opened.exposure)
-        assert opened.exposure == pytest.approx(good / 3, rel=1e-3)
+        third = pytest.approx(good / 3, rel=1e-3)
+        until(line, lambda told: told["gain"] == 6.0 and told["exposure"] == third)
+        assert opened.exposure == third
         wish(name="automatic", value=True)
         until(line, lambda told: told["exposure"] == pytest.approx(good / 2, rel=0.3))
         line.socket.close()
