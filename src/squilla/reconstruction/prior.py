@@ -305,6 +305,8 @@ class Estimators:
     def mixture(self, shape: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the posterior mean and variance of the coefficients, and the log evidence.
 
+        Pieces of the sheet of single lines take part where a shape comes near them.
+
         Parameters
         ----------
         shape : Tensor, (N, D)
