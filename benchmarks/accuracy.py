@@ -22,8 +22,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from dead_leaves import dead_leaves
 from scipy.io import loadmat
 from torch import Generator, Tensor
+from torch.nn import functional
 
 import squilla
 from squilla.calibration.alignment import Measurement
@@ -35,9 +37,8 @@ from squilla.reconstruction.compound import Compound
 from squilla.reconstruction.models import load_model
 from squilla.reconstruction.reconstructor import Reconstructor
 from squilla.spectra import grid
-from squilla.training.compound import misaligned
 from squilla.training.noise import add_noise
-from squilla.training.scenes import Palette, draw_scenes
+from squilla.training.prior import Palette
 
 RESULTS = Path(__file__).parents[1] / "experiments" / "results" / "accuracy.json"
 WAVELENGTH = grid()
@@ -126,8 +127,20 @@ def line_chart(size: int = 250) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray]
 def textures(seed: int, size: int = 250) -> Tensor:
     """Return a scene of leaves painted with reflectances and lamps that nobody trained on."""
     palette = Palette(WAVELENGTH, held_out=True, seed=99, count=2000)
-    scenes = draw_scenes(1, size, palette, Generator().manual_seed(seed))
-    return scenes.cubes(torch.arange(size * size)[None])[0].view(size, size, -1)
+    return dead_leaves(palette, size, Generator().manual_seed(seed))
+
+
+def misaligned(y: Tensor, deviation: float, generator: Generator) -> Tensor:
+    """Displace every channel of a picture, (H, W, M), by a random fraction of a pixel.
+
+    deviation : standard deviation along rows and columns, px.
+    """
+    by = (deviation * torch.randn(1, y.shape[-1], 2, generator=generator)).clamp(-1, 1)[0]
+    taps = (1 - (torch.arange(-1, 2) - by[..., None]).abs()).clamp_min(0)  # (M, 2, 3), bilinear
+    kernel = taps[:, 0, :, None] * taps[:, 1, None, :]
+    kernel = kernel / kernel.sum((-1, -2), keepdim=True)
+    wide = functional.pad(y.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")
+    return functional.conv2d(wide, kernel[:, None], groups=len(by))[0].permute(1, 2, 0)
 
 
 def cases(quick: bool) -> list[Case]:
@@ -161,7 +174,7 @@ def cases(quick: bool) -> list[Case]:
     for wrong in (-5, 5):
         row = case(f"noise stated {wrong:+d} dB, chart 20 dB", home, chart, 20)
         rows.append(replace(row, snr=20.0 + wrong))
-    y = misaligned(home.project(chart)[None], 0.3, generator)[0]
+    y = misaligned(home.project(chart), 0.3, generator)
     y = add_noise(y, 20, generator)
     rows.append(Case("misaligned 0.3 px, chart 20 dB", home, chart, y, 20))
     tilted = random_array(13, angle=ANGLES)

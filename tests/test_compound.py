@@ -26,7 +26,7 @@ from squilla.reconstruction.prior import Estimators, Prior, broad_prior, fit_mix
 from squilla.spectra import CHART_LIGHT, grid, lights
 from squilla.training.compound import Recipe, Studio, from_checkpoint, misaligned, train_compound
 from squilla.training.noise import add_noise
-from squilla.training.scenes import Palette, draw_scenes
+from squilla.training.prior import Palette, draw_scenes
 
 CAMERA = smooth_camera(0, filters=20, bands=126)
 

@@ -1,20 +1,16 @@
-"""The back end of the compound model on a processor, and spectra worked out only where asked.
+"""Pictures of the compound model on a processor, and spectra worked out only where asked.
 
-`back_end.BackEnd` says what is computed. Here its three networks are left to an engine, and the
-rest runs in loops that pass memory once. What comes out stays in coefficients until somebody wants
-bands, spectra or the whole cube.
+`interval.descend` says what is computed, here in loops that pass memory once. What comes out stays
+in coefficients until somebody wants bands, spectra or the whole cube.
 """
 
-import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from squilla.reconstruction.compiled import inherited
-from squilla.reconstruction.engine import Network
+from squilla.reconstruction.compiled import inherited, mix
 from squilla.reconstruction.evidence import CORRECTED, SPECTRAL, Evidence
 from squilla.reconstruction.kernels import ONE, compiled, over_rows, sigmoid, times
 from squilla.threads import single_threaded_products
@@ -23,86 +19,18 @@ _CHANGED = CORRECTED[0]
 
 
 @compiled
-def _unit(cell, scale):
-    """Return the rms of coefficients relative to their scale."""
-    total = np.float32(0)
-    for i in range(scale.size):
-        total += (cell[i] / scale[i]) ** 2
-    return max(math.sqrt(total / scale.size), np.float32(1e-6))
-
-
-@compiled
-def _clamped(value, most):
-    return min(max(value, -most), most)
-
-
-@compiled
-def _coarse_inputs(first, last, coefficients, variance, features, scale, inputs):
-    """Write what the network of the coarse cells sees; see `back_end.BackEnd`."""
-    size, ten = scale.size, np.float32(10)
+def _changes(first, last, kin, coarse, own, alone, changes):
+    """Write by how much cells change the leading coefficients that they inherit."""
+    below, right = coarse.shape[0] - 1, coarse.shape[1] - 1
+    low = np.empty(own.shape[2], np.float32)
     for row in range(first, last):
-        for column in range(inputs.shape[1]):
-            cell, spread, seen = (
-                coefficients[row, column],
-                variance[row, column],
-                inputs[row, column],
-            )
-            unit = _unit(cell, scale)
-            for i in range(size):
-                seen[i] = _clamped(cell[i] / (scale[i] * unit), ten)
-            for i in range(size):
-                doubt = math.sqrt(spread[i]) / (scale[i] * unit)
-                seen[size + i] = math.log(max(doubt, np.float32(1e-6)))
-            seen[2 * size] = features[row, column, 0] / 4
-            seen[2 * size + 1] = features[row, column, 1] / 4
-
-
-@compiled
-def _unevenness(amplitude, smooth, deviation):
-    return _clamped((smooth / amplitude - ONE) / deviation, np.float32(10))
-
-
-@compiled
-def _fine_inputs(first, last, low, own, noise, alone, scale, amplitude, smooth, inputs):
-    """Write what the network of a finer level sees; an amplitude counts at the finest alone."""
-    used, ten = scale.size, np.float32(10)
-    for row in range(first, last):
-        for column in range(inputs.shape[1]):
-            cell, itself, seen = low[row, column], own[row, column], inputs[row, column]
-            unit, deviation = _unit(cell, scale), math.sqrt(noise[row, column])
-            told = max(deviation, np.float32(0.02))
-            for i in range(used):
-                seen[i] = _clamped(cell[i] / (scale[i] * unit), ten)
-            for i in range(used):
-                seen[used + i] = _clamped((itself[i] - cell[i]) / (scale[i] * unit * told), ten)
-            seen[2 * used] = math.log(deviation) + 3
-            seen[2 * used + 1] = _clamped(alone[row, column], ten) / 4
-            seen[2 * used + 2] = math.log(unit)
-            seen[2 * used + 3] = 0
-            if amplitude.size:
-                bright, even = amplitude[row, column], smooth[row, column]
-                seen[2 * used + 3] = _unevenness(bright, even, deviation)
-
-
-@compiled
-def _fine_changes(
-    first, last, low, own, noise, alone, scale, found, amplitude, smooth, changes, bright
-):
-    """Write how a finer level changes the leading coefficients, and the amplitude."""
-    used = scale.size
-    for row in range(first, last):
-        for column in range(changes.shape[1]):
-            cell, told, change = low[row, column], found[row, column], changes[row, column]
-            deviation = math.sqrt(noise[row, column])
-            step = deviation * _unit(cell, scale)
-            itself = sigmoid(alone[row, column] + told[used])
-            for i in range(used):
-                change[i] = itself * (own[row, column, i] - cell[i]) + step * scale[i] * told[i]
-            if amplitude.size:
-                uneven = _unevenness(amplitude[row, column], smooth[row, column], deviation)
-                calm = uneven * math.exp(-3 * uneven * uneven) * deviation
-                calm *= sigmoid(told[used + 1])
-                bright[row, column] = amplitude[row, column] * (ONE + calm)
+        up, down = max((row - 1) // 2, 0), min((row + 1) // 2, below)
+        for column in range(own.shape[1]):
+            before, after = max((column - 1) // 2, 0), min((column + 1) // 2, right)
+            mix(kin[row, column], coarse, up, down, before, after, low, low.size)
+            itself = sigmoid(alone[row, column])
+            for i in range(low.size):
+                changes[row, column, i] = itself * (own[row, column, i] - low[i])
 
 
 @compiled
@@ -172,42 +100,26 @@ class Coded:
         return np.maximum(whole @ basis, 0) * self.bright[row, column, None]
 
 
-def refine(seen: Evidence, networks: Sequence[Network], scale: np.ndarray, threads: int) -> Coded:
-    """Do what `back_end.BackEnd` does, up to the coefficients, for one picture.
+def blended(seen: Evidence, known: np.ndarray, threads: int) -> Coded:
+    """Do what `interval.descend` does, for one picture.
 
-    networks : of the coarse cells, of the finest and of those between.
+    known : (h, w), what brightness is multiplied by; of the picture before it was filled up.
     """
-
-    def run(kernel: Callable[..., None], picture: np.ndarray, *arguments) -> np.ndarray:
-        over_rows(kernel, len(picture), threads, *arguments, picture)
-        return picture
 
     def array(values: Tensor) -> np.ndarray:
         return values[0].numpy()
 
-    spectral, *finer = networks
-    coefficients, variance = array(seen.coefficients), array(seen.variance)
-    inputs = np.empty((*coefficients.shape[:2], 2 * len(scale) + 2), np.float32)
-    run(_coarse_inputs, inputs, coefficients, variance, array(seen.features), scale)
-    x = coefficients + np.sqrt(variance) * spectral(inputs[None])[0, ..., : len(scale)]
-    nothing = np.empty((0, 0), np.float32)
-    changes = bright = nothing
+    x = array(seen.coefficients)
+    changes = np.empty(0, np.float32)
     for level in reversed(range(SPECTRAL)):
-        kin, alone, own, noise = (
-            array(values[level]) for values in (seen.kin, seen.alone, seen.own, seen.noise)
-        )
-        used, sides = own.shape[-1], own.shape[:2]
-        light = nothing, nothing
-        if level == 0:
-            light = array(seen.amplitude), array(seen.smooth)
-            bright = np.empty(sides, np.float32)
-        low = run(inherited, np.empty((*sides, len(scale) if level else used), np.float32), kin, x)
-        told = low, own, noise, alone, scale[:used]
-        inputs = run(_fine_inputs, np.empty((*sides, 2 * used + 4), np.float32), *told, *light)
-        found = finer[level](inputs[None])[0]
-        changes = np.empty((*sides, used), np.float32)
-        over_rows(_fine_changes, sides[0], threads, *told, found, *light, changes, bright)
+        kin, alone, own = (array(each[level]) for each in (seen.kin, seen.alone, seen.own))
+        changes = np.empty_like(own)
+        over_rows(_changes, len(own), threads, kin, x, own, alone, changes)
         if level:
+            low = np.empty((*own.shape[:2], x.shape[-1]), np.float32)
+            over_rows(inherited, len(own), threads, kin, x, low)
+            low[..., : own.shape[-1]] += changes
             x = low
-            x[..., :used] += changes
+    height, width = known.shape
+    bright = array(seen.pixels.amplitude)[:height, :width] * known
     return Coded(x, array(seen.kin[0]), changes, bright)

@@ -14,18 +14,21 @@ import torch
 from torch import Tensor
 
 from squilla.reconstruction.evidence import (
+    ALIKE,
     CORRECTED,
     LEVELS,
-    MODEL_NOISE,
+    MISFITS,
+    SAMPLE,
     SPECTRAL,
     TOLD,
     Evidence,
+    View,
 )
 from squilla.reconstruction.kernels import ONE, add_product, compiled, over_rows, sigmoid
 from squilla.reconstruction.posteriors import CompiledCamera, by_zone, mixture, wiener
 from squilla.threads import single_threaded_products
 
-_HALF, _MODEL = np.float32(0.5), np.float32(MODEL_NOISE)
+_HALF, _ALIKE = np.float32(0.5), np.float32(ALIKE)
 _ROWS = 16
 """Rows of a picture that are worked on at a time where a step leaves something to the next."""
 
@@ -153,7 +156,7 @@ def _coarser(first, last, fine, power, view):
             for i in range(4):
                 share[i, i] = ONE / parts[i][0]
                 for j in range(i):
-                    against = _telling(parts[i][0] + parts[j][0] + 2 * _MODEL, power, scale)
+                    against = _telling(parts[i][0] + parts[j][0] + 2 * _ALIKE, power, scale)
                     alike = sigmoid(against - _difference(parts[i], parts[j], scale))
                     share[i, j], share[j, i] = alike / parts[j][0], alike / parts[i][0]
             most, certainty = 0, np.float32(0)
@@ -175,7 +178,7 @@ def _among_neighbours(first, last, view, power, known):
     for row in range(first, last):
         for column in range(width):
             own, cell = view[row, column], known[row, column]
-            against = _telling(2 * (own[0] + _MODEL), power, scale)
+            against = _telling(2 * (own[0] + _ALIKE), power, scale)
             weight = ONE / own[0]
             for i in range(1, size):
                 cell[i] = weight * own[i]
@@ -209,18 +212,18 @@ def _kinship(first, last, view, known, coarse, power, kin, alone):
                 coarse[up, before], coarse[up, after], coarse[down, before], coarse[down, after]
             )  # fmt: skip
             mean = (around[0][0] + around[1][0] + around[2][0] + around[3][0]) / 4
-            against = _telling(own[0] + mean + 2 * _MODEL, power, scale)
+            against = _telling(own[0] + mean + 2 * _ALIKE, power, scale)
             most = np.float32(-np.inf)
             for number in range(4):
                 shares[number] = against - _difference(own, around[number], scale)
                 most = max(most, shares[number])
             total = np.float32(0)
             for number in range(4):
-                shares[number] = math.exp(shares[number] - most) / (around[number][0] + _MODEL)
+                shares[number] = math.exp(shares[number] - most) / (around[number][0] + _ALIKE)
                 total += shares[number]
             for number in range(4):
                 shares[number] /= total
-            alone[row, column] = -math.log((known[row, column, 0] + _MODEL) * total) - most
+            alone[row, column] = -math.log((known[row, column, 0] + _ALIKE) * total) - most
 
 
 @compiled
@@ -286,6 +289,7 @@ def gather_evidence(
     camera: CompiledCamera,
     zone: np.ndarray | None,
     threads: int,
+    interval: bool = False,
 ) -> Evidence:
     """Do what `evidence.gather_evidence` does, for one picture.
 
@@ -300,10 +304,12 @@ def gather_evidence(
     camera : CompiledCamera
     zone : array, (H, W), int, optional
     threads : int
+    interval : bool
+        Work out the variance too.
     """
     step = 2**LEVELS
     sides = tuple(side + -side % step for side in ratio.shape)
-    size, basis = camera.vectors.shape[1], camera.mixture[4].shape[-1]
+    size, basis = camera.vectors.shape[1], camera.basis
 
     def run(kernel: Callable[..., None], rows: int, *arguments) -> None:
         over_rows(kernel, rows, threads, *arguments)
@@ -330,45 +336,60 @@ def gather_evidence(
         kin[level], alone[level] = empty(level, 4), empty(level)
         view, rows = views[level], len(views[level])
         run(_kinship, rows, view, known[level], best, camera.power, kin[level], alone[level])
-        mixed = empty(level, 2 + (size if level >= SPECTRAL else TOLD if level else 0))
+        if level == 0:
+            break
+        mixed = empty(level, 2 + (size if level >= SPECTRAL else TOLD))
         run(inherited, rows, kin[level], best, mixed)
-        if level:
-            run(_besides_itself, rows, alone[level], known[level], mixed)
+        run(_besides_itself, rows, alone[level], known[level], mixed)
         best = mixed
         if level == SPECTRAL:
             spectral = best
 
     places = [_zones(zone, sides, level) for level in range(SPECTRAL + 1)]
-    coefficients = empty(SPECTRAL, basis)
-    variance, features = np.empty_like(coefficients), empty(SPECTRAL, 2)
-    place, scores = places[SPECTRAL], empty(SPECTRAL, camera.scores.shape[-1])
-    run(by_zone, len(spectral), spectral, place, camera.scores, scores)
-    run(
-        mixture, len(spectral), scores, spectral,
-        place, *camera.mixture, coefficients, variance, features,
-    )  # fmt: skip
+    misfit = np.float32(MISFITS[0])
+
+    def posterior(view: np.ndarray, place: np.ndarray, misfit: np.float32, knots: int):
+        """Return mean, variance at the knots if there are any, and evidence."""
+        found, evidence = np.empty((*place.shape, basis), np.float32), np.empty_like(view[..., 0])
+        scores = np.empty((*place.shape, camera.scores.shape[-1]), np.float32)
+        variance = np.empty((*place.shape, knots), np.float32)
+        run(by_zone, len(view), view, place, camera.scores, scores)
+        results = found, variance, evidence
+        run(mixture, len(view), scores, view, place, misfit, *camera.mixture, *results)
+        return results
+
+    some = np.ascontiguousarray(spectral[::SAMPLE, ::SAMPLE])
+    there = np.ascontiguousarray(places[SPECTRAL][::SAMPLE, ::SAMPLE])
+    best = -np.inf
+    for one in map(np.float32, MISFITS):
+        likely = posterior(some, there, one, 0)[2].mean(dtype=float)
+        if likely <= best:
+            break
+        best, misfit = likely, one
+    coefficients, variance, _ = posterior(
+        spectral, places[SPECTRAL], misfit, camera.knots if interval else 0
+    )
     own = [empty(level, CORRECTED[level]) for level in range(SPECTRAL)]
     for level, (view, place) in enumerate(zip(known[:SPECTRAL], places, strict=False)):
         matrices = camera.vectors, camera.spread, camera.gains[level]
-        run(wiener, len(view), view, place, *matrices, own[level])
+        run(wiener, len(view), view, place, misfit, *matrices, own[level])
 
     def pictures(values: Iterable[np.ndarray]) -> list[Tensor]:
         return [torch.from_numpy(value)[None] for value in values]
 
+    def seen(view: np.ndarray) -> View:
+        return View(*pictures((view[..., 2:], view[..., 0], view[..., 1])))
+
     finer = range(SPECTRAL)
-    mean, spread, features, bright, smooth = pictures(
-        (coefficients, variance, features, views[0][..., 1], best[..., 1])
-    )
     return Evidence(
-        coefficients=mean,
-        variance=spread,
-        features=features,
+        *pictures((coefficients, variance)),
         kin=pictures(kin[level] for level in finer),
         alone=pictures(alone[level] for level in finer),
         own=pictures(own),
-        noise=pictures(known[level][..., 0] + _MODEL for level in finer),
-        amplitude=bright,
-        smooth=smooth,
+        own_noise=pictures(known[level][..., 0] + misfit for level in finer),
+        pixels=seen(views[0]),
+        cells=seen(views[SPECTRAL]),
+        spectral=seen(spectral),
     )
 
 

@@ -1,16 +1,15 @@
-"""One model for every camera: exact estimates at several scales, then a small network.
+"""One model for every camera: exact estimates at several scales, trained by nobody.
 
-A front end that nobody trained (`evidence`) turns the measurement of any calibrated camera into
-posteriors of the coefficients of a fixed basis of spectra. A small convolutional network behind it
-has learnt, over many random cameras, scenes and noises, what is left to be mended, and how far the
-result may be off. `docs/compound.md` tells the whole story.
+A front end (`evidence`) turns the measurement of any calibrated camera into posteriors of the
+coefficients of a fixed basis of spectra, at several scales; each pixel then takes the spectrum of
+its kin, or keeps to itself (`interval`). What was learnt is the prior: what spectra look like.
+`docs/compound.md` tells the whole story.
 
 Pictures are (B, H, W, channels); level l has cells of 2^l px.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,9 +22,8 @@ from squilla.calibration.alignment import Measurement
 from squilla.calibration.calibration import Calibration
 from squilla.errors import InputError
 from squilla.reconstruction import compiled
-from squilla.reconstruction.back_end import BackEnd, Told, hats
-from squilla.reconstruction.coded import Coded, refine
-from squilla.reconstruction.engine import Network, compile_network, write_onnx
+from squilla.reconstruction.coded import blended
+from squilla.reconstruction.engine import check_engine
 from squilla.reconstruction.evidence import (
     LEVELS,
     Camera,
@@ -33,9 +31,10 @@ from squilla.reconstruction.evidence import (
     gather_evidence,
     noise_factor,
 )
+from squilla.reconstruction.interval import descend, half_width
 from squilla.reconstruction.partial import CodedReconstruction, Reconstruction
 from squilla.reconstruction.posteriors import CompiledCamera
-from squilla.reconstruction.prior import Prior, broad_prior
+from squilla.reconstruction.prior import Prior, broad_prior, hats
 from squilla.reconstruction.reconstructor import (
     Reconstructor,
     Scale,
@@ -84,24 +83,19 @@ class Compound(Reconstructor):
         for key, value in prior.tensors().items():  # the file of the weights holds the prior too
             self.register_buffer(f"prior_{key}", value)
         self.prior = prior.on(calibration.wavelength)
-        between = hats(len(self.wavelength))
-        self.back = BackEnd(self.prior, between)
         self.register_buffer("basis", self.prior.basis.T.float(), persistent=False)
-        self.register_buffer("hats", between, persistent=False)
+        self.register_buffer("hats", hats(len(self.wavelength)).float(), persistent=False)
         self._cameras: dict[tuple[bool, ...], tuple[Camera, Camera]] = {}
         self._compiled: dict[Camera, CompiledCamera] = {}
-        self._networks: list[Network] | None = None
 
-    def _take(self, engine: str) -> None:
-        if engine.startswith("cuda"):
+    def with_engine(self, engine: str) -> "Compound":
+        check_engine(engine)
+        if engine != "torch":
             raise InputError(
-                "`compound` runs on a GPU as it is: call model.to('cuda'). Engines are for the "
-                "other networks there."
+                "`compound` is no network: on a processor compiled loops compute it, on a GPU call "
+                "model.to('cuda'). Leave the engine out."
             )
-        self._networks = None if engine == "torch" else self._made(engine)
-
-    def _made(self, engine: str) -> list[Network]:
-        return [compile_network(Told(network), engine) for network in self.back.networks()]
+        return self
 
     @classmethod
     def for_weights(cls, calibration: Calibration, weights: Mapping[str, Tensor]) -> "Compound":
@@ -169,18 +163,11 @@ class Compound(Reconstructor):
             return Reconstruction(self, measurement)
         camera, ratio, zone = self._told(y, angle, snr, channels)
         with torch.inference_mode():
-            coded = self._coded(*self._evidence(y, ratio, camera, zone))
+            coded = blended(*self._evidence(y, ratio, camera, zone), torch.get_num_threads())
         return CodedReconstruction(self, measurement, coded, self.basis.numpy())
 
     def export(self, path: str | Path) -> None:
-        """Write the networks of the back end as ONNX files, one for each size of cells.
-
-        `path` gets -4, -2 and -1, the side of the cells in px, before its suffix.
-        """
-        path = Path(path)
-        for network, side in zip(self.back.networks(), (4, 1, 2), strict=True):
-            shape = (1, 16, 16, network.enter.in_features)
-            write_onnx(Told(network), shape, path.with_stem(f"{path.stem}-{side}"))
+        raise InputError("`compound` is no network; there is nothing to export.")
 
     def _usable(self, measurement: Measurement):
         """Return y, angle, snr and channels of a measurement.
@@ -281,10 +268,11 @@ class Compound(Reconstructor):
     ) -> tuple[Tensor, Tensor | None]:
         height, width = y.shape[1:3]
         levels = min(LEVELS, math.ceil(math.log2(max(height, width))))
-        if levels == LEVELS and not torch.is_grad_enabled() and y.device.type == "cpu":
-            seen, known = self._evidence(y[0], ratio[0], camera, None if zone is None else zone[0])
+        if levels == LEVELS and y.device.type == "cpu" and not y.requires_grad:
+            here = None if zone is None else zone[0]
+            seen, known = self._evidence(y[0], ratio[0], camera, here, interval)
             if not interval:
-                coded = self._coded(seen, known)
+                coded = blended(seen, known, torch.get_num_threads())
                 cube = coded.spell_out(self.basis.numpy(), torch.get_num_threads())
                 return torch.from_numpy(cube)[None], None
             known = torch.from_numpy(known)
@@ -294,12 +282,13 @@ class Compound(Reconstructor):
             known = torch.where(finite, lit.float(), torch.nan)
             y, ratio = torch.where(finite[..., None], y, 0), torch.where(lit, ratio, torch.inf)
             seen = self._torch_evidence(y, ratio, camera, zone, levels)
-        coefficients, amplitude, spread = self.back(seen, interval)
-        amplitude = (amplitude[:, :height, :width] * known)[..., None]
-        x = ((coefficients[:, :height, :width] * amplitude) @ self.basis).relu_()
-        if spread is not None:
-            spread = (spread[:, :height, :width] * amplitude) @ self.hats
-        return x, spread
+        amplitude = (seen.pixels.amplitude[:, :height, :width] * known)[..., None]
+        x = (descend(seen)[:, :height, :width] * amplitude) @ self.basis
+        if not interval:
+            return x.relu_(), None
+        zone = None if zone is None else _filled_up(zone, 2**levels)
+        spread = half_width(seen, camera, zone)[:, :height, :width]
+        return x.relu_(), (spread * amplitude) @ self.hats
 
     def _torch_evidence(
         self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None, levels: int
@@ -309,16 +298,18 @@ class Compound(Reconstructor):
         if min(height, width) >= SMALLEST:
             ratio = ratio * noise_factor(y, ratio, camera)
         step = 2**levels
-        below, right = -height % step, -width % step
-        if below or right:
-            y = functional.pad(y, (0, 0, 0, right, 0, below))
-            ratio = functional.pad(ratio, (0, right, 0, below), value=torch.inf)
-            if zone is not None:
-                zone = functional.pad(zone, (0, right, 0, below))
+        y = _filled_up(y.permute(0, 3, 1, 2), step).permute(0, 2, 3, 1)
+        ratio = _filled_up(ratio, step, torch.inf)
+        zone = None if zone is None else _filled_up(zone, step)
         return gather_evidence(y, ratio, camera, levels, zone)
 
     def _evidence(
-        self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None
+        self,
+        y: Tensor,
+        ratio: Tensor,
+        camera: Camera,
+        zone: Tensor | None,
+        interval: bool = False,
     ) -> tuple[Evidence, np.ndarray]:
         """Return what the front end says of one picture, by loops compiled for a processor.
 
@@ -337,16 +328,18 @@ class Compound(Reconstructor):
         if min(stated.shape) >= SMALLEST:
             factor = compiled.noise_factor(values, stated, matrices, threads)
         places = None if zone is None else zone.numpy()
-        seen = compiled.gather_evidence(values, stated, factor, matrices, places, threads)
+        seen = compiled.gather_evidence(
+            values, stated, factor, matrices, places, threads, interval
+        )
         return seen, known
-
-    def _coded(self, seen: Evidence, known: np.ndarray) -> Coded:
-        networks = self._networks or self._made("torch")
-        coded = refine(seen, networks, self.back.scale.numpy(), torch.get_num_threads())
-        height, width = known.shape
-        return replace(coded, bright=coded.bright[:height, :width] * known)
 
 
 def _joined(parts: list[Tensor]) -> Tensor:
     """Put parts one after another; one alone is not copied."""
     return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _filled_up(pictures: Tensor, step: int, value: float = 0) -> Tensor:
+    """Append rows and columns, the last two axes, until there are multiples of `step`."""
+    height, width = pictures.shape[-2:]
+    return functional.pad(pictures, (0, -width % step, 0, -height % step), value=value)

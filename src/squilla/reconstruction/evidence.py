@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from squilla.reconstruction.prior import Estimators, Prior
+from squilla.reconstruction.estimators import Estimators
+from squilla.reconstruction.prior import Prior
 
 LEVELS = 4
 """Halvings from the picture to the coarsest cells."""
@@ -31,8 +32,14 @@ TOLD = 12
 CORRECTED = (16, 32)
 """Leading coefficients that cells of levels 0 and 1 know something of by themselves."""
 
-MODEL_NOISE = 1e-5
-"""What calibrations are wrong by, as a share of the signal's power: 50 dB."""
+ALIKE = 1e-5
+"""Variance by which shapes may differ and still be of one spectrum."""
+
+MISFITS = tuple(10 ** (-number / 2) for number in range(12, 3, -1))
+"""What calibrations may be wrong by, as a share of the signal's power: 60 dB to 20."""
+
+SAMPLE = 4
+"""Every so many rows and columns of the spectral cells tell which it is."""
 
 
 class Camera:
@@ -66,14 +73,17 @@ class Camera:
         """The posteriors, zone by zone."""
         seen = kept[:, :TOLD].T @ seen / unit
         moment = prior.moment * (len(white) / (seen @ prior.moment @ seen.T).trace())
-        self.power = (seen @ moment @ seen.T).diagonal().clamp_min(1e-12).float()
+        power = (seen @ moment @ seen.T).diagonal().clamp_min(1e-12)
+        self.power = power.float()
         """(TOLD,), variance of shapes in the leading directions."""
+        self.shown = ((prior.knots @ moment @ seen.T) / power).square().T.float()
+        """(TOLD, KNOTS), variance of spectra that differ by one in a leading direction."""
         self.quiet = vectors[:, -(len(white) // 2) :].float()
         """(M, M // 2), directions that hardly any spectrum reaches: what they see is noise."""
 
     def to(self, device: torch.device | str) -> "Camera":
         """Move everything to a device, in place."""
-        for name in ("project", "power", "quiet"):
+        for name in ("project", "power", "shown", "quiet"):
             setattr(self, name, getattr(self, name).to(device))
         for zone in self.zones:
             zone.to(device)
@@ -123,7 +133,7 @@ def coarser(view: View, camera: Camera) -> View:
     joined = parts(torch.cat([view.shape, view.amplitude[..., None]], -1))
     noise = parts(view.noise)[..., 0]
     told = joined[..., :TOLD]
-    both = noise[..., :, None] + noise[..., None, :] + 2 * MODEL_NOISE
+    both = noise[..., :, None] + noise[..., None, :] + 2 * ALIKE
     scale, against = _telling(both, camera)
     differ = ((told[..., :, None, :] - told[..., None, :, :]).square() * scale).sum(-1)
     itself = torch.eye(4, dtype=torch.bool, device=noise.device)
@@ -140,7 +150,7 @@ def among_neighbours(view: View, camera: Camera) -> View:
     weight = 1 / view.noise
     told = view.shape[..., :TOLD]
     # Neighbours are about as noisy as the cell itself.
-    scale, against = _telling(2 * (view.noise + MODEL_NOISE), camera)
+    scale, against = _telling(2 * (view.noise + ALIKE), camera)
     content = torch.cat([view.shape, view.amplitude[..., None]], -1)
     around = functional.pad(torch.cat([content, weight[..., None]], -1), (0, 0, 1, 1, 1, 1))
     total = content * weight[..., None]
@@ -182,14 +192,14 @@ def kinship(view: View, own: View, coarse: View, camera: Camera) -> tuple[Tensor
     for (y, x), phase, cells in _four(*view.noise.shape[1:]):
         h, w = coarse.noise.shape[1:]
         noise = view.noise[phase] + mean[:, y : y + h, x : x + w]
-        scale, against = _telling(noise + 2 * MODEL_NOISE, camera)
+        scale, against = _telling(noise + 2 * ALIKE, camera)
         logs = []
         for cell in cells:
             other = around[cell]
             differ = ((other[..., :-1] - told[phase]).square() * scale).sum(-1) - against
-            logs.append(-differ - (other[..., -1] + MODEL_NOISE).log())
+            logs.append(-differ - (other[..., -1] + ALIKE).log())
         logs = torch.stack(logs, -1)
-        alone = -(own.noise[phase] + MODEL_NOISE).log() - torch.logsumexp(logs, -1)
+        alone = -(own.noise[phase] + ALIKE).log() - torch.logsumexp(logs, -1)
         phases.append(torch.cat([torch.softmax(logs, -1), alone[..., None]], -1))
     both = _interleaved(phases)
     return both[..., :4], both[..., 4]
@@ -253,25 +263,26 @@ def _interleaved(phases: list[Tensor]) -> Tensor:
 
 @dataclass
 class Evidence:
-    """Everything that the front end hands on, of the same size for every camera.
+    """Everything that the front end finds, of the same size for every camera.
 
-    coefficients, variance : (B, H, W, C) at the level SPECTRAL, posterior mean and variance.
-    features : (B, H, W, 2) there: log noise and log evidence.
+    coefficients : (B, H, W, C) at the level SPECTRAL, posterior mean.
+    variance : (B, H, W, KNOTS) there, of the spectrum at the knots.
     kin, alone : of `kinship` for the levels below, finest first.
     own : what the cells of these levels say by themselves, (B, H, W, CORRECTED[level]).
-    noise : noise variance of that, (B, H, W).
-    amplitude : (B, H, W) as measured; smooth : the same averaged over kin.
+    own_noise : noise variance of that, (B, H, W).
+    pixels, cells : what was measured at level 0 and at the level SPECTRAL.
+    spectral : from what the spectra were inferred.
     """
 
     coefficients: Tensor
     variance: Tensor
-    features: Tensor
     kin: list[Tensor]
     alone: list[Tensor]
     own: list[Tensor]
-    noise: list[Tensor]
-    amplitude: Tensor
-    smooth: Tensor
+    own_noise: list[Tensor]
+    pixels: View
+    cells: View
+    spectral: View
 
 
 def gather_evidence(
@@ -317,41 +328,45 @@ def gather_evidence(
         best = View.parted(torch.lerp(inherited, known[level].joined(size), itself))
         if level == lowest:
             spectral = best
-    smooth = inherit(kin[0], best.amplitude[..., None])[..., 0] if levels else amplitude
-
-    def estimated(level: int, view: View, estimate):
-        return _by_zone(
-            estimate, camera.zones, _coarse_zone(zone, 2**level), view.shape,
-            view.noise + MODEL_NOISE,
-        )  # fmt: skip
-
-    mean, variance, evidence = estimated(lowest, spectral, Estimators.mixture)
-    own = [
-        estimated(
-            level, known[level],
-            lambda one, shape, noise, size=CORRECTED[level]: (one.wiener(shape, noise, size),),
-        )[0]
-        for level in range(lowest)
-    ]  # fmt: skip
-    noise = (spectral.noise + MODEL_NOISE).log()
-    return Evidence(
-        mean,
-        variance,
-        torch.stack([noise, evidence.clamp(-20, 20)], -1),
-        kin,
-        alone,
-        own,
-        [known[level].noise + MODEL_NOISE for level in range(lowest)],
-        amplitude,
-        smooth,
+    places = [coarse_zone(zone, 2**level) for level in range(lowest + 1)]
+    misfit = torch.full_like(spectral.noise[:, :1, :1], MISFITS[0])
+    if levels == LEVELS:
+        misfit = measured_misfit(spectral, camera, places[lowest])
+    mean, variance, _ = by_zone(
+        Estimators.mixture, camera.zones, places[lowest], spectral.shape, spectral.noise + misfit
     )
+    own, own_noise = [], [view.noise + misfit for view in known[:lowest]]
+    for view, noise, place, size in zip(known, own_noise, places, CORRECTED, strict=False):
+        one = by_zone(
+            lambda zone, shape, noise, size=size: (zone.wiener(shape, noise, size),),
+            camera.zones, place, view.shape, noise,
+        )  # fmt: skip
+        own += one
+    return Evidence(mean, variance, kin, alone, own, own_noise, views[0], views[lowest], spectral)
 
 
-def _coarse_zone(zone: Tensor | None, step: int) -> Tensor | None:
+def measured_misfit(spectral: View, camera: Camera, zone: Tensor | None) -> Tensor:
+    """Return what makes some of the cells most likely: by how much the calibration is wrong.
+
+    It is one of `MISFITS`, a variance that adds to the noise and that no averaging removes;
+    (B, 1, 1).
+    """
+    some = (slice(None), slice(None, None, SAMPLE), slice(None, None, SAMPLE))
+    shape, noise = spectral.shape[some], spectral.noise[some]
+    zone = None if zone is None else zone[some]
+    each = []
+    for misfit in MISFITS:
+        _, _, evidence = by_zone(Estimators.mixture, camera.zones, zone, shape, noise + misfit)
+        each.append(evidence.clamp(-20, 20).mean((1, 2)))
+    best = torch.stack(each).argmax(0)
+    return torch.tensor(MISFITS, device=noise.device)[best][:, None, None]
+
+
+def coarse_zone(zone: Tensor | None, step: int) -> Tensor | None:
     return None if zone is None else zone[:, step // 2 :: step, step // 2 :: step].contiguous()
 
 
-def _by_zone(estimate, zones: list[Estimators], zone: Tensor | None, shape: Tensor, noise: Tensor):
+def by_zone(estimate, zones: list[Estimators], zone: Tensor | None, shape: Tensor, noise: Tensor):
     """Apply each zone's estimator to its own cells; returns pictures."""
     grid = noise.shape
     shape, noise = shape.reshape(-1, shape.shape[-1]), noise.reshape(-1)

@@ -7,11 +7,11 @@ import math
 
 import numpy as np
 
-from squilla.reconstruction.evidence import CORRECTED, MODEL_NOISE, Camera
+from squilla.reconstruction.estimators import BEYOND, LEADING, QUIETEST
+from squilla.reconstruction.evidence import CORRECTED, Camera
 from squilla.reconstruction.kernels import ONE, add_product, compiled
-from squilla.reconstruction.prior import BEYOND, LEADING
 
-_MODEL, _BEYOND = np.float32(MODEL_NOISE), np.float32(BEYOND)
+_BEYOND = np.float32(BEYOND)
 
 _LIKELY = np.float32(1e-6)
 """Clusters less likely than this leave no trace in a posterior."""
@@ -27,6 +27,7 @@ class CompiledCamera:
             return np.ascontiguousarray(np.stack([getattr(zone, name) for zone in zones]))
 
         self.channels = np.float32(camera.channels)
+        self.basis, self.knots = zones[0].knots.shape
         self.project = camera.project.numpy()
         self.flat = np.ascontiguousarray(camera.project[:, -1].numpy())
         self.quiet, self.power = np.ascontiguousarray(camera.quiet.numpy()), camera.power.numpy()
@@ -44,7 +45,7 @@ class CompiledCamera:
             stacked("mean"),
             stacked("log_share"),
             stacked("within"),
-            LEADING,
+            np.ascontiguousarray(zones[0].knots[:LEADING]),
         )
 
 
@@ -65,7 +66,7 @@ def by_zone(first, last, view, zone, matrices, product):
 
 
 @compiled
-def wiener(first, last, view, zone, vectors, power, gain, own):
+def wiener(first, last, view, zone, misfit, vectors, power, gain, own):
     """Write the linear estimate of `Estimators.wiener`, as many coefficients as `own` has."""
     score = np.empty((1, view.shape[1], vectors.shape[2]), np.float32)
     for row in range(first, last):
@@ -75,7 +76,7 @@ def wiener(first, last, view, zone, vectors, power, gain, own):
         while start < view.shape[1]:
             where, stop = zone[row, start], start
             while stop < view.shape[1] and zone[row, stop] == where:
-                cell, noise = score[0, stop], view[row, stop, 0] + _MODEL
+                cell, noise = score[0, stop], view[row, stop, 0] + misfit
                 for i in range(cell.size):
                     cell[i] /= power[where, i] + noise
                 stop += 1
@@ -85,12 +86,13 @@ def wiener(first, last, view, zone, vectors, power, gain, own):
 
 @compiled
 def mixture(
-    first, last, scores, view, zone, pieces, reach, offset, power, gain, mean, log_share, within,
-    leading, found, variance, features,
+    first, last, scores, view, zone, misfit, pieces, reach, offset, power, gain, mean, log_share,
+    within, knots, found, variance, evidence,
 ):  # fmt: skip
     """Write the posterior of `Estimators.mixture`; clusters without a say are left out.
 
     scores : of every cell, by what was learnt, and how far it goes along the middle of each piece.
+    variance : left out if it has no rows.
     """
     clusters, directions = power.shape[1:]
     size, nodes, learnt = found.shape[2], log_share.shape[1], clusters - reach.shape[1]
@@ -102,7 +104,7 @@ def mixture(
     for row in range(first, last):
         for column in range(found.shape[1]):
             seen, where, cell = scores[row, column], zone[row, column], view[row, column, 2:]
-            noise = view[row, column, 0] + _MODEL
+            noise = view[row, column, 0] + misfit
             count = learnt
             for k in range(learnt):
                 likely[k] = k
@@ -123,23 +125,24 @@ def mixture(
                         count += 1
                         score[k] = -offset[where, k]
                         add_product(cell, pieces[where, piece], score[k])
-            place = min(max(math.log10(noise) * 2 + 10, 0.0), nodes - 1.0)
+            place = min(max(math.log10(noise) * 2 + 2 * QUIETEST, 0.0), nodes - 1.0)
             low = min(int(place), nodes - 2)
             high = np.float32(place - low)
             tables, most = log_share[where], np.float32(-np.inf)
             for k in likely[:count]:
-                misfit, own, known = np.float32(0), score[k], power[where, k]
+                unlike, own, known = np.float32(0), score[k], power[where, k]
                 for i in range(directions):
-                    misfit += own[i] * own[i] / (known[i] + noise)
-                weight[k] = (ONE - high) * tables[low, k] + high * tables[low + 1, k] - misfit / 2
+                    unlike += own[i] * own[i] / (known[i] + noise)
+                weight[k] = (ONE - high) * tables[low, k] + high * tables[low + 1, k] - unlike / 2
                 most = max(most, weight[k])
             total = np.float32(0)
             for k in likely[:count]:
                 weight[k] = math.exp(weight[k] - most)
                 total += weight[k]
-            mixed, spread = found[row, column], variance[row, column]
+            told = np.float32((most + math.log(total)) / directions)
+            evidence[row, column] = min(max(told, np.float32(-20)), np.float32(20))
+            mixed = found[row, column]
             mixed[:] = 0
-            spread[:] = 0
             for k in likely[:count]:
                 weight[k] /= total
                 if weight[k] < _LIKELY:
@@ -149,16 +152,25 @@ def mixture(
                     scaled[i] = own[i] / (known[i] + noise)
                 each[k] = mean[where, k]
                 add_product(scaled, gain[where, k], each[k])
-                near, far = weight[k] * (ONE - high), weight[k] * high
-                one, other = within[where, low, k], within[where, low + 1, k]
                 for i in range(size):
                     mixed[i] += weight[k] * each[k, i]
-                    spread[i] += near * one[i] + far * other[i]
-            for k in likely[:count]:
-                if weight[k] >= _LIKELY:
-                    for i in range(leading):
-                        apart = each[k, i] - mixed[i]
-                        spread[i] += weight[k] * apart * apart
-            evidence = (most + math.log(total)) / directions
-            features[row, column, 0] = math.log(noise)
-            features[row, column, 1] = min(max(evidence, np.float32(-20)), np.float32(20))
+            if variance.size:
+                spread = variance[row, column]
+                spread[:] = 0
+                for k in likely[:count]:
+                    if weight[k] >= _LIKELY:
+                        near, far = within[where, low, k], within[where, low + 1, k]
+                        _add_spread(weight[k], near, far, high, each[k], mixed, knots, spread)
+
+
+@compiled
+def _add_spread(weight, near, far, high, one, mixed, knots, spread):
+    """Add a cluster's variance, and how far it is from the mean, to the variance at the knots."""
+    apart = np.zeros(spread.size, np.float32)
+    for i in range(knots.shape[0]):
+        off = one[i] - mixed[i]
+        for knot in range(spread.size):
+            apart[knot] += off * knots[i, knot]
+    for knot in range(spread.size):
+        within = (ONE - high) * near[knot] + high * far[knot]
+        spread[knot] += weight * (within + apart[knot] * apart[knot])

@@ -11,12 +11,13 @@ into pieces so small that each is nearly flat; a piece counts where a measuremen
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from importlib.resources import files as package_files
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from squilla.priors import within_tables
 from squilla.spectra import resample
@@ -27,8 +28,11 @@ STORED = "weights.prior_"
 SINGLE_LINES = 0.05
 """Share of spectra that show one line and nothing else."""
 
-CENTRES, WIDTHS, WIDEST = 80, 5, 30.0
+CENTRES, WIDTHS, WIDEST = 80, 6, 30.0
 """Pieces of the sheet of lines along centre and width, and the largest FWHM, nm."""
+
+KNOTS = 51
+"""Wavelengths at which doubt is worked out; linear in between."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,7 @@ class Prior:
     covariance : (G, C, C).
     learnt : how many clusters, the first, were learnt from examples; the others are pieces of the
         sheet of single lines.
+    beyond : (G - learnt, KNOTS) variance of single lines that the basis does not hold.
     All float64.
     """
 
@@ -54,6 +59,18 @@ class Prior:
     mean: Tensor
     covariance: Tensor
     learnt: int
+    beyond: Tensor
+
+    @cached_property
+    def knots(self) -> Tensor:
+        """Means of the basis around the knots, (KNOTS, C)."""
+        return around_knots(len(self.wavelength)) @ self.basis
+
+    @cached_property
+    def spread(self) -> Tensor:
+        """Variance of each cluster at the knots, (G, KNOTS)."""
+        held = torch.einsum("kc,gcd,kd->gk", self.knots, self.covariance, self.knots)
+        return held + functional.pad(self.beyond, (0, 0, self.learnt, 0))
 
     def on(self, wavelength: np.ndarray) -> "Prior":
         """Return the prior on another grid.
@@ -63,7 +80,15 @@ class Prior:
         """
         at = np.clip(within_tables(wavelength), self.wavelength[0], self.wavelength[-1])
         basis = resample(self.basis.numpy().T, self.wavelength, at).T
-        return replace(self, wavelength=wavelength, basis=torch.from_numpy(basis))
+        here = np.linspace(0, len(at) - 1, KNOTS)
+        there = np.linspace(self.wavelength[0], self.wavelength[-1], KNOTS)
+        beyond = resample(self.beyond.numpy(), there, np.interp(here, np.arange(len(at)), at))
+        return replace(
+            self,
+            wavelength=wavelength,
+            basis=torch.from_numpy(basis),
+            beyond=torch.from_numpy(beyond),
+        )
 
     def tensors(self) -> dict[str, Tensor]:
         """Return what was learnt for a file; the covariances as their halves below the diagonal."""
@@ -102,7 +127,7 @@ class Prior:
         covariance: Tensor,
     ) -> "Prior":
         """Add the sheet of single lines to what was learnt."""
-        middle, spread = line_sheet(wavelength, basis)
+        middle, spread, beyond = line_sheet(wavelength, basis)
         each = torch.full((len(middle),), SINGLE_LINES / max(len(middle), 1), dtype=share.dtype)
         return cls(
             wavelength,
@@ -112,6 +137,7 @@ class Prior:
             torch.cat([mean, middle]),
             torch.cat([covariance, spread]),
             len(share),
+            beyond,
         )
 
 
@@ -160,29 +186,49 @@ def fit_prior(
     )
 
 
-def line_sheet(wavelength: np.ndarray, basis: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean (G, C) and covariance (G, C, C) of the shapes of single lines, piece by piece.
+def line_sheet(wavelength: np.ndarray, basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what single lines look like, piece by piece.
 
-    Lines of every centre in the band, and of every width (FWHM) from two bands to `WIDEST` nm; none
+    Lines of every centre in the band, and of every width (FWHM) from one band to `WIDEST` nm; none
     where the bands are too far apart to show them.
+
+    Returns
+    -------
+    mean (G, C), covariance (G, C, C) : of shapes in the basis.
+    beyond : (G, KNOTS) mean square of what the basis does not hold.
     """
-    finest = 2 * float(np.diff(wavelength).max())
-    if finest >= WIDEST:
+    finest = float(np.diff(wavelength).max())
+    if 2 * finest >= WIDEST:
         empty = basis.new_zeros(0, basis.shape[1])
-        return empty, empty[:, :, None] * empty[:, None]
+        return empty, empty[:, :, None] * empty[:, None], basis.new_zeros(0, KNOTS)
     inside = (np.arange(7) + 0.5) / 7
     band = wavelength[-1] - wavelength[0]
     centre = wavelength[0] + band * (np.arange(CENTRES)[:, None] + inside) / CENTRES
     width = finest * (WIDEST / finest) ** ((np.arange(WIDTHS)[:, None] + inside) / WIDTHS)
     away = (wavelength - centre[:, None, :, None, None]) / width[:, None, :, None]
     spectra = torch.from_numpy(np.exp(-4 * np.log(2) * away**2))  # (CENTRES, WIDTHS, 7, 7, K)
-    shape = (spectra / spectra.mean(-1, keepdim=True)) @ basis
-    shape = shape.flatten(2, 3).flatten(0, 1)
+    spectra = (spectra / spectra.mean(-1, keepdim=True)).flatten(2, 3).flatten(0, 1)
+    shape = spectra @ basis
+    beyond = (spectra - shape @ basis.T).square().mean(1) @ around_knots(len(wavelength)).T
     mean = shape.mean(1)
     offset = shape - mean[:, None]
     spread = offset.mT @ offset / offset.shape[1]
     ridge = 1e-6 * mean.square().mean()
-    return mean, spread + ridge * torch.eye(basis.shape[1], dtype=basis.dtype)
+    return mean, spread + ridge * torch.eye(basis.shape[1], dtype=basis.dtype), beyond
+
+
+def hats(bands: int) -> Tensor:
+    """Return the matrix of linear interpolation from the knots to the bands, (KNOTS, K)."""
+    place = np.linspace(0, KNOTS - 1, bands)
+    return torch.from_numpy(
+        np.stack([np.interp(place, np.arange(KNOTS), unit) for unit in np.eye(KNOTS)])
+    )
+
+
+def around_knots(bands: int) -> Tensor:
+    """Return the matrix of weighted means of the bands around each knot, (KNOTS, K)."""
+    weight = hats(bands)
+    return weight / weight.sum(1, keepdim=True)
 
 
 def fit_mixture(points: Tensor, clusters: int, *, rounds: int = 40) -> tuple[Tensor, ...]:
@@ -231,141 +277,3 @@ def fit_mixture(points: Tensor, clusters: int, *, rounds: int = 40) -> tuple[Ten
         responsible = torch.softmax(torch.stack(logs, 1), 1)
         share = count / len(points)
     return share, mean, torch.stack(covariance)
-
-
-# --- posteriors ---------------------------------------------------------------------------------
-
-LEADING = 16
-"""Coefficients for which the clusters' disagreement counts in the variance."""
-
-_WITHIN, BEYOND = 5.0, 3.0
-"""How far from its middle a piece of the sheet reaches, in its own variance, and in the noise's."""
-
-_NODES = torch.arange(13)
-"""Noise variances between which tables are interpolated: 10^-5 to 10, two to a decade."""
-
-
-class Estimators:
-    """The posteriors that a prior and one response matrix imply, ready for any noise.
-
-    Noise is white over the channels. In the eigenvectors U of the response's covariance, U' y has
-    independent components of variance L + noise; so the estimators of any noise differ by a
-    division alone.
-
-    Parameters
-    ----------
-    response : Tensor, (D, K), float64
-        Of the camera, in D orthogonal directions of its channels.
-    flat : Tensor, (K,), float64
-        The functional of the spectrum that measured shapes are divided by.
-    channels : int
-        M; measured shapes have a mean power of about one over the channels.
-    prior : Prior
-    """
-
-    def __init__(self, response: Tensor, flat: Tensor, channels: int, prior: Prior):
-        seen, amplitude = response @ prior.basis, flat @ prior.basis
-        moment = prior.moment * (channels / (seen @ prior.moment @ seen.T).trace())
-        self.power, self.vectors, self.gain = _eigen(seen, moment)
-        # A camera may be blind to much of a cluster: its shapes are those of amplitude one.
-        unit = 1 / (prior.mean @ amplitude).clamp_min(0.2)
-        mean = prior.mean * unit[:, None]
-        covariance = prior.covariance * unit.square()[:, None, None]
-        # Amplitudes are noisy themselves, so shapes are known up to a factor.
-        covariance = covariance + 0.1**2 * mean[:, :, None] * mean[:, None, :]
-        power, vectors, gain = _eigen(seen, covariance)  # (G, D), (G, D, D), (G, D, C)
-        self.mean = mean.float()
-        self.cluster_power = power.float()
-        self.cluster_gain = gain.float()
-        self.scores = vectors.transpose(0, 1).float()  # (D, G, D)
-        self.offset = torch.einsum("gd,gde->ge", mean @ seen.T, vectors).float()  # (G, D)
-        total = power + 10 ** (_NODES.double() / 2 - 5)[:, None, None]  # (J, G, D)
-        self.log_share = (prior.share.log() - total.log().sum(-1) / 2).float()  # (J, G)
-        self.learnt = prior.learnt
-        piece = slice(prior.learnt, None)
-        middle = mean[piece] @ seen.T
-        middle = middle / middle.norm(dim=1, keepdim=True)  # (L, D)
-        beside = 1 - torch.einsum("gd,gde->ge", middle, vectors[piece]).square()
-        self.middle = middle.T.contiguous().float()  # (D, L)
-        self.reach = _WITHIN * (power[piece] * beside).sum(-1).float()  # (L,)
-        prior_variance = covariance.diagonal(dim1=-2, dim2=-1)
-        within = prior_variance - torch.einsum("jgd,gdc->jgc", 1 / total, gain.square())
-        self.within = within.clamp_min(1e-10).float()  # (J, G, C)
-        self.power, self.vectors, self.gain = (
-            value.float() for value in (self.power, self.vectors, self.gain)
-        )
-
-    def to(self, device: torch.device | str) -> "Estimators":
-        """Move all matrices to a device, in place."""
-        for name, value in vars(self).items():
-            if isinstance(value, Tensor):
-                setattr(self, name, value.to(device))
-        return self
-
-    def mixture(self, shape: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the posterior mean and variance of the coefficients, and the log evidence.
-
-        Pieces of the sheet of single lines take part where a shape comes near them.
-
-        Parameters
-        ----------
-        shape : Tensor, (N, D)
-            Measured shapes.
-        noise : Tensor, (N,)
-            Noise variance of each.
-
-        Returns
-        -------
-        mean (N, C), variance (N, C), log evidence (N,) per direction
-        """
-        near = self.near(shape, noise)
-        if shape.device.type != "cpu":  # without asking how many, so that it can be recorded
-            return self._posterior(shape, noise, near)
-        some = near.any(1)
-        if not some.any():
-            return self._posterior(shape, noise, None)
-        mean, variance, evidence = self._posterior(shape, noise, None)
-        mean[some], variance[some], evidence[some] = self._posterior(
-            shape[some], noise[some], near[some]
-        )
-        return mean, variance, evidence
-
-    def near(self, shape: Tensor, noise: Tensor) -> Tensor:
-        """Return which pieces of the sheet each shape comes near, (N, L)."""
-        beside = shape.square().sum(1, keepdim=True) - (shape @ self.middle).square()
-        return beside <= self.reach + BEYOND * shape.shape[1] * noise[:, None]
-
-    def _posterior(
-        self, shape: Tensor, noise: Tensor, near: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Do what `mixture` says, by what was learnt alone or by the pieces that are near too."""
-        count, size = shape.shape
-        own = slice(self.learnt if near is None else None)
-        scores, offset = self.scores[:, own].flatten(1), self.offset[own].flatten()
-        score = (shape @ scores - offset).view(count, -1, size)
-        scaled = score / (self.cluster_power[own] + noise[:, None, None])
-        place = (noise.log10() * 2 + 10).clamp(0, len(_NODES) - 1)
-        node = torch.relu(1 - (place[:, None] - _NODES.to(noise.device)).abs())  # (N, J)
-        logs = node @ self.log_share[:, own] - (score * scaled).sum(-1) / 2
-        if near is not None:
-            logs[:, self.learnt :].masked_fill_(~near, -torch.inf)
-        weight = torch.softmax(logs, 1)
-        gain, middle, within = self.cluster_gain[own], self.mean[own], self.within[:, own]
-        each = torch.bmm(scaled.transpose(0, 1), gain[..., :LEADING])
-        each = each.transpose(0, 1) + middle[:, :LEADING]
-        scaled = (scaled * weight[..., None]).flatten(1)
-        mean = torch.addmm(weight @ middle, scaled, gain.flatten(0, 1))
-        variance = (node[:, :, None] * weight[:, None]).flatten(1) @ within.flatten(0, 1)
-        apart = (each - mean[:, None, :LEADING]).square()
-        variance[:, :LEADING] += (weight[:, None] @ apart)[:, 0]
-        return mean, variance, torch.logsumexp(logs, 1) / size
-
-    def wiener(self, shape: Tensor, noise: Tensor, size: int) -> Tensor:
-        """Return the best linear estimate of the first coefficients, (N, D), (N,) -> (N, size)."""
-        return (shape @ self.vectors / (self.power + noise[:, None])) @ self.gain[:, :size]
-
-
-def _eigen(seen: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return eigenvalues, eigenvectors and gains of Gaussians as a camera sees them."""
-    power, vectors = torch.linalg.eigh(seen @ covariance @ seen.T)
-    return power.clamp_min(0), vectors, vectors.mT @ seen @ covariance

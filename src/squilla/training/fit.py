@@ -139,7 +139,8 @@ def train(
         if file is not None and not Path(file).resolve().parent.is_dir():
             raise InputError(f"{file} cannot be written: there is no such folder; make it first.")
     if kind.universal:
-        from squilla.training.compound import Recipe, train_compound
+        from squilla.reconstruction.compound import Compound
+        from squilla.training.prior import learn_prior
 
         own = {
             "noise": noise, "gain_error": gain_error, "dropped": dropped, "spectra": spectra,
