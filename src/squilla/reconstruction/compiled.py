@@ -25,7 +25,7 @@ from squilla.reconstruction.evidence import (
     View,
 )
 from squilla.reconstruction.kernels import ONE, add_product, compiled, over_rows, sigmoid
-from squilla.reconstruction.posteriors import CompiledCamera, by_zone, mixture, wiener
+from squilla.reconstruction.posteriors import CompiledCamera, mixture, wiener
 from squilla.threads import single_threaded_products
 
 _HALF, _ALIKE = np.float32(0.5), np.float32(ALIKE)
@@ -350,12 +350,10 @@ def gather_evidence(
 
     def posterior(view: np.ndarray, place: np.ndarray, misfit: np.float32, knots: int):
         """Return mean, variance at the knots if there are any, and evidence."""
-        found, evidence = np.empty((*place.shape, basis), np.float32), np.empty_like(view[..., 0])
-        scores = np.empty((*place.shape, camera.scores.shape[-1]), np.float32)
+        found = np.empty((*place.shape, basis), np.float32)
         variance = np.empty((*place.shape, knots), np.float32)
-        run(by_zone, len(view), view, place, camera.scores, scores)
-        results = found, variance, evidence
-        run(mixture, len(view), scores, view, place, misfit, *camera.mixture, *results)
+        results = found, variance, np.empty(place.shape, np.float32)
+        run(mixture, len(view), view, place, misfit, *camera.mixture, *results)
         return results
 
     some = np.ascontiguousarray(spectral[::SAMPLE, ::SAMPLE])
@@ -386,7 +384,7 @@ def gather_evidence(
         kin=pictures(kin[level] for level in finer),
         alone=pictures(alone[level] for level in finer),
         own=pictures(own),
-        own_noise=pictures(known[level][..., 0] + misfit for level in finer),
+        own_noise=pictures(known[level][..., 0] + misfit for level in finer if interval),
         pixels=seen(views[0]),
         cells=seen(views[SPECTRAL]),
         spectral=seen(spectral),

@@ -32,13 +32,13 @@ TOLD = 12
 CORRECTED = (16, 32)
 """Leading coefficients that cells of levels 0 and 1 know something of by themselves."""
 
-ALIKE = 1e-5
+ALIKE = 1e-6
 """Variance by which shapes may differ and still be of one spectrum."""
 
 MISFITS = tuple(10 ** (-number / 2) for number in range(12, 3, -1))
 """What calibrations may be wrong by, as a share of the signal's power: 60 dB to 20."""
 
-SAMPLE = 4
+SAMPLE = 6
 """Every so many rows and columns of the spectral cells tell which it is."""
 
 

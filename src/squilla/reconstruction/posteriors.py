@@ -35,8 +35,8 @@ class CompiledCamera:
         self.gains = [np.ascontiguousarray(gain[..., :size]) for size in CORRECTED]
         learnt, scores = zones[0].learnt, stacked("scores")  # (Z, D, G, D)
         known = scores[:, :, :learnt].reshape(*scores.shape[:2], -1)
-        self.scores = np.concatenate([known, stacked("middle")], -1)
         self.mixture = (
+            np.concatenate([known, stacked("middle")], -1),
             np.ascontiguousarray(scores[:, :, learnt:].swapaxes(1, 2)),
             stacked("reach"),
             stacked("offset"),
@@ -86,81 +86,97 @@ def wiener(first, last, view, zone, misfit, vectors, power, gain, own):
 
 @compiled
 def mixture(
-    first, last, scores, view, zone, misfit, pieces, reach, offset, power, gain, mean, log_share,
+    first, last, view, zone, misfit, scores, pieces, reach, offset, power, gain, mean, log_share,
     within, knots, found, variance, evidence,
 ):  # fmt: skip
     """Write the posterior of `Estimators.mixture`; clusters without a say are left out.
 
-    scores : of every cell, by what was learnt, and how far it goes along the middle of each piece.
-    variance : left out if it has no rows.
+    scores : matrices that tell of each cell how it scores with what was learnt, and how far it goes
+        along the middle of each piece.
+    variance : left out if it has no knots.
     """
+    told = np.empty((1, view.shape[1], scores.shape[2]), np.float32)  # a row stays in the cache
+    for row in range(first, last):
+        one = slice(row, row + 1)
+        by_zone(0, 1, view[one], zone[one], scores, told)
+        _mixed(
+            told[0], view[row], zone[row], misfit, pieces, reach, offset, power, gain, mean,
+            log_share, within, knots, found[row], variance[row], evidence[row],
+        )  # fmt: skip
+
+
+@compiled
+def _mixed(
+    scores, view, zone, misfit, pieces, reach, offset, power, gain, mean, log_share,
+    within, knots, found, variance, evidence,
+):  # fmt: skip
+    """Do the work of `mixture` for one row."""
     clusters, directions = power.shape[1:]
-    size, nodes, learnt = found.shape[2], log_share.shape[1], clusters - reach.shape[1]
+    size, nodes, learnt = found.shape[1], log_share.shape[1], clusters - reach.shape[1]
     scaled = np.empty(directions, np.float32)
     score = np.empty((clusters, directions), np.float32)
     each = np.empty((clusters, size), np.float32)
     weight = np.empty(clusters, np.float32)
     likely = np.empty(clusters, np.int64)
-    for row in range(first, last):
-        for column in range(found.shape[1]):
-            seen, where, cell = scores[row, column], zone[row, column], view[row, column, 2:]
-            noise = view[row, column, 0] + misfit
-            count = learnt
-            for k in range(learnt):
-                likely[k] = k
-                own, shift = score[k], offset[where, k]
-                for i in range(directions):
-                    own[i] = seen[k * directions + i] - shift[i]
-            beside, closest = -_BEYOND * np.float32(directions) * noise, np.float32(-np.inf)
+    for column in range(found.shape[0]):
+        seen, where, cell = scores[column], zone[column], view[column, 2:]
+        noise = view[column, 0] + misfit
+        count = learnt
+        for k in range(learnt):
+            likely[k] = k
+            own, shift = score[k], offset[where, k]
             for i in range(directions):
-                beside += cell[i] * cell[i]
-            along, wide = seen[learnt * directions :], reach[where]
+                own[i] = seen[k * directions + i] - shift[i]
+        beside, closest = -_BEYOND * np.float32(directions) * noise, np.float32(-np.inf)
+        for i in range(directions):
+            beside += cell[i] * cell[i]
+        along, wide = seen[learnt * directions :], reach[where]
+        for piece in range(wide.size):
+            closest = max(closest, along[piece] * along[piece] + wide[piece])
+        if closest >= beside:
             for piece in range(wide.size):
-                closest = max(closest, along[piece] * along[piece] + wide[piece])
-            if closest >= beside:
-                for piece in range(wide.size):
-                    if along[piece] * along[piece] + wide[piece] >= beside:
-                        k = learnt + piece
-                        likely[count] = k
-                        count += 1
-                        score[k] = -offset[where, k]
-                        add_product(cell, pieces[where, piece], score[k])
-            place = min(max(math.log10(noise) * 2 + 2 * QUIETEST, 0.0), nodes - 1.0)
-            low = min(int(place), nodes - 2)
-            high = np.float32(place - low)
-            tables, most = log_share[where], np.float32(-np.inf)
+                if along[piece] * along[piece] + wide[piece] >= beside:
+                    k = learnt + piece
+                    likely[count] = k
+                    count += 1
+                    score[k] = -offset[where, k]
+                    add_product(cell, pieces[where, piece], score[k])
+        place = min(max(math.log10(noise) * 2 + 2 * QUIETEST, 0.0), nodes - 1.0)
+        low = min(int(place), nodes - 2)
+        high = np.float32(place - low)
+        tables, most = log_share[where], np.float32(-np.inf)
+        for k in likely[:count]:
+            unlike, own, known = np.float32(0), score[k], power[where, k]
+            for i in range(directions):
+                unlike += own[i] * own[i] / (known[i] + noise)
+            weight[k] = (ONE - high) * tables[low, k] + high * tables[low + 1, k] - unlike / 2
+            most = max(most, weight[k])
+        total = np.float32(0)
+        for k in likely[:count]:
+            weight[k] = math.exp(weight[k] - most)
+            total += weight[k]
+        told = np.float32((most + math.log(total)) / directions)
+        evidence[column] = min(max(told, np.float32(-20)), np.float32(20))
+        mixed = found[column]
+        mixed[:] = 0
+        for k in likely[:count]:
+            weight[k] /= total
+            if weight[k] < _LIKELY:
+                continue
+            own, known = score[k], power[where, k]
+            for i in range(directions):
+                scaled[i] = own[i] / (known[i] + noise)
+            each[k] = mean[where, k]
+            add_product(scaled, gain[where, k], each[k])
+            for i in range(size):
+                mixed[i] += weight[k] * each[k, i]
+        if variance.size:
+            spread = variance[column]
+            spread[:] = 0
             for k in likely[:count]:
-                unlike, own, known = np.float32(0), score[k], power[where, k]
-                for i in range(directions):
-                    unlike += own[i] * own[i] / (known[i] + noise)
-                weight[k] = (ONE - high) * tables[low, k] + high * tables[low + 1, k] - unlike / 2
-                most = max(most, weight[k])
-            total = np.float32(0)
-            for k in likely[:count]:
-                weight[k] = math.exp(weight[k] - most)
-                total += weight[k]
-            told = np.float32((most + math.log(total)) / directions)
-            evidence[row, column] = min(max(told, np.float32(-20)), np.float32(20))
-            mixed = found[row, column]
-            mixed[:] = 0
-            for k in likely[:count]:
-                weight[k] /= total
-                if weight[k] < _LIKELY:
-                    continue
-                own, known = score[k], power[where, k]
-                for i in range(directions):
-                    scaled[i] = own[i] / (known[i] + noise)
-                each[k] = mean[where, k]
-                add_product(scaled, gain[where, k], each[k])
-                for i in range(size):
-                    mixed[i] += weight[k] * each[k, i]
-            if variance.size:
-                spread = variance[row, column]
-                spread[:] = 0
-                for k in likely[:count]:
-                    if weight[k] >= _LIKELY:
-                        near, far = within[where, low, k], within[where, low + 1, k]
-                        _add_spread(weight[k], near, far, high, each[k], mixed, knots, spread)
+                if weight[k] >= _LIKELY:
+                    near, far = within[where, low, k], within[where, low + 1, k]
+                    _add_spread(weight[k], near, far, high, each[k], mixed, knots, spread)
 
 
 @compiled
