@@ -45,6 +45,7 @@ def _spectra(palette: Palette, count: int, generator: Generator) -> Tensor:
     Seven scenes in ten are natural, most under one lamp; the others show Gaussian mixtures,
     lines, or some of each.
     """
+
     def random(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
 

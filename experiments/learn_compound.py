@@ -22,7 +22,7 @@ from torch import Generator
 import squilla
 from squilla.reconstruction.compound import Compound
 from squilla.spectra import grid
-from squilla.training.prior import Palette, learn_prior
+from squilla.training.prior import LEARNT, Palette, learn_prior
 
 WEIGHTS = Path(squilla.__file__).parent / "data" / "weights" / "compound.safetensors"
 RESULTS = Path(__file__).parent / "results" / "learn_compound.json"
@@ -31,7 +31,7 @@ RESULTS = Path(__file__).parent / "results" / "learn_compound.json"
 def main() -> None:
     parser = argparse.ArgumentParser(description="Learn the prior of the compound model.")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--count", type=int, default=60_000, help="spectra to learn from")
+    parser.add_argument("--count", type=int, default=LEARNT, help="spectra to learn from")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=WEIGHTS)
     options = parser.parse_args()
@@ -55,7 +55,7 @@ def main() -> None:
         "threads": torch.get_num_threads(),
         "device": options.device,
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "spectra kept aside, rms that the basis does not hold": float(beyond.norm() / spectra.norm()),
+        "not held of spectra kept aside, rms": float(beyond.norm() / spectra.norm()),
     }
     RESULTS.write_text(json.dumps(story, indent=1) + "\n")
     print(f"{options.output}: {story}")

@@ -327,6 +327,8 @@ def test_compound_refuses_what_it_does_not_take(monkeypatch):
         train("compound", CAMERA, noise=20, look=print)
     with pytest.raises(InputError, match="leave out precision"):
         train("compound", CAMERA, precision="bfloat16")
+    with pytest.raises(InputError, match="leave out epochs, checkpoint"):
+        train("compound", CAMERA, epochs=7, checkpoint="run.checkpoint")
 
 
 # --- the command ----------------------------------------------------------------------------

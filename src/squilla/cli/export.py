@@ -15,8 +15,8 @@ def export_model(
 
     ONNX Runtime, OpenVINO and phones read it.
 
-    A network of single pixels takes measurements divided by their maximum, (N, filters). Of
-    `compound`, the three networks behind its front end are written, a file for each size of cells.
+    It takes measurements divided by their maximum, (N, filters), and gives spectra before their
+    scale is restored. `compound` is no network and stays here.
 
     Example: squilla export-model --calibration camera.nc --model respecnn.safetensors -o net.onnx
     """

@@ -101,9 +101,11 @@ def train(
     trained.save(output)
     if as_json:
         typer.echo(json.dumps({"model": model, "file": str(output), **trained.provenance}))
-    else:
+    elif "validation" in trained.provenance:
         error = trained.provenance["validation"]
         typer.echo(f"{output}: {model}, validation error {error:.5f}")
+    else:
+        typer.echo(f"{output}: {model}, learnt from {trained.provenance['count']} spectra")
 
 
 def parse_noise(text: str) -> "Noise":

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from squilla.reconstruction.compiled import inherited, mix
 from squilla.reconstruction.evidence import CORRECTED, SPECTRAL, Evidence
-from squilla.reconstruction.kernels import ONE, compiled, over_rows, sigmoid, times
+from squilla.reconstruction.kernels import compiled, over_rows, sigmoid, times
 from squilla.threads import single_threaded_products
 
 _CHANGED = CORRECTED[0]

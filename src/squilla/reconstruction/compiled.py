@@ -23,6 +23,7 @@ from squilla.reconstruction.evidence import (
     TOLD,
     Evidence,
     View,
+    likeliest,
 )
 from squilla.reconstruction.kernels import ONE, add_product, compiled, over_rows, sigmoid
 from squilla.reconstruction.posteriors import CompiledCamera, mixture, wiener
@@ -346,7 +347,6 @@ def gather_evidence(
             spectral = best
 
     places = [_zones(zone, sides, level) for level in range(SPECTRAL + 1)]
-    misfit = np.float32(MISFITS[0])
 
     def posterior(view: np.ndarray, place: np.ndarray, misfit: np.float32, knots: int):
         """Return mean, variance at the knots if there are any, and evidence."""
@@ -356,14 +356,13 @@ def gather_evidence(
         run(mixture, len(view), view, place, misfit, *camera.mixture, *results)
         return results
 
-    some = np.ascontiguousarray(spectral[::SAMPLE, ::SAMPLE])
-    there = np.ascontiguousarray(places[SPECTRAL][::SAMPLE, ::SAMPLE])
-    best = -np.inf
-    for one in map(np.float32, MISFITS):
-        likely = posterior(some, there, one, 0)[2].mean(dtype=float)
-        if likely <= best:
-            break
-        best, misfit = likely, one
+    # The same cells as often as there are misfits, below one another, each with its own.
+    some = np.tile(spectral[::SAMPLE, ::SAMPLE], (len(MISFITS), 1, 1))
+    there = np.tile(places[SPECTRAL][::SAMPLE, ::SAMPLE], (len(MISFITS), 1))
+    some[..., 0] += np.repeat(MISFITS, len(some) // len(MISFITS))[:, None]
+    _, _, likely = posterior(some, there, np.float32(0), 0)
+    likely = torch.from_numpy(likely).view(len(MISFITS), -1).mean(1, keepdim=True)
+    misfit = np.float32(MISFITS[int(likeliest(likely))])
     coefficients, variance, _ = posterior(
         spectral, places[SPECTRAL], misfit, camera.knots if interval else 0
     )

@@ -90,12 +90,10 @@ class Compound(Reconstructor):
 
     def with_engine(self, engine: str) -> "Compound":
         check_engine(engine)
-        if engine != "torch":
-            raise InputError(
-                "`compound` is no network: on a processor compiled loops compute it, on a GPU call "
-                "model.to('cuda'). Leave the engine out."
-            )
-        return self
+        raise InputError(
+            "`compound` is no network: compiled loops compute it on a processor, and tensors on a "
+            "GPU after model.to('cuda'). Leave the engine out."
+        )
 
     @classmethod
     def for_weights(cls, calibration: Calibration, weights: Mapping[str, Tensor]) -> "Compound":
@@ -328,9 +326,7 @@ class Compound(Reconstructor):
         if min(stated.shape) >= SMALLEST:
             factor = compiled.noise_factor(values, stated, matrices, threads)
         places = None if zone is None else zone.numpy()
-        seen = compiled.gather_evidence(
-            values, stated, factor, matrices, places, threads, interval
-        )
+        seen = compiled.gather_evidence(values, stated, factor, matrices, places, threads, interval)
         return seen, known
 
 

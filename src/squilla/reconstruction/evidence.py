@@ -10,6 +10,7 @@ Pictures are (B, H, W, channels); level l has cells of 2^l px.
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -35,10 +36,10 @@ CORRECTED = (16, 32)
 ALIKE = 1e-6
 """Variance by which shapes may differ and still be of one spectrum."""
 
-MISFITS = tuple(10 ** (-number / 2) for number in range(12, 3, -1))
+MISFITS = 10.0 ** np.arange(-6, -1.9, 0.5)
 """What calibrations may be wrong by, as a share of the signal's power: 60 dB to 20."""
 
-SAMPLE = 6
+SAMPLE = 8
 """Every so many rows and columns of the spectral cells tell which it is."""
 
 
@@ -329,7 +330,7 @@ def gather_evidence(
         if level == lowest:
             spectral = best
     places = [coarse_zone(zone, 2**level) for level in range(lowest + 1)]
-    misfit = torch.full_like(spectral.noise[:, :1, :1], MISFITS[0])
+    misfit = torch.full_like(spectral.noise[:, :1, :1], float(MISFITS[0]))
     if levels == LEVELS:
         misfit = measured_misfit(spectral, camera, places[lowest])
     mean, variance, _ = by_zone(
@@ -346,7 +347,7 @@ def gather_evidence(
 
 
 def measured_misfit(spectral: View, camera: Camera, zone: Tensor | None) -> Tensor:
-    """Return what makes some of the cells most likely: by how much the calibration is wrong.
+    """Return by how much the calibration is wrong: what makes some of the cells likely.
 
     It is one of `MISFITS`, a variance that adds to the noise and that no averaging removes;
     (B, 1, 1).
@@ -354,12 +355,22 @@ def measured_misfit(spectral: View, camera: Camera, zone: Tensor | None) -> Tens
     some = (slice(None), slice(None, None, SAMPLE), slice(None, None, SAMPLE))
     shape, noise = spectral.shape[some], spectral.noise[some]
     zone = None if zone is None else zone[some]
-    each = []
-    for misfit in MISFITS:
-        _, _, evidence = by_zone(Estimators.mixture, camera.zones, zone, shape, noise + misfit)
-        each.append(evidence.clamp(-20, 20).mean((1, 2)))
-    best = torch.stack(each).argmax(0)
-    return torch.tensor(MISFITS, device=noise.device)[best][:, None, None]
+    likely = [
+        by_zone(Estimators.mixture, camera.zones, zone, shape, noise + misfit)[2]
+        for misfit in MISFITS.tolist()
+    ]
+    best = likeliest(torch.stack(likely).clamp(-20, 20).mean((2, 3)))
+    return torch.from_numpy(MISFITS).to(noise)[best][:, None, None]
+
+
+def likeliest(evidence: Tensor) -> Tensor:
+    """Return the largest of `MISFITS` that is likelier than the next smaller, (J, B) -> (B,).
+
+    An unlikely spectrum explains a wrong calibration too, to the last digit if the channels are
+    few; but that all of a picture is unlikely is more so.
+    """
+    number = torch.arange(1, len(evidence), device=evidence.device)
+    return torch.where((evidence[1:] > evidence[:-1]).mT, number, 0).amax(-1)
 
 
 def coarse_zone(zone: Tensor | None, step: int) -> Tensor | None:

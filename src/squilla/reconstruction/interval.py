@@ -26,7 +26,7 @@ NINETY = 1.645
 """Half the width of the central 90 % of a normal distribution, in standard deviations."""
 
 MISTAKEN = 0.3
-"""Variance that kin add by being mistaken for the same, in each leading direction, of their noise."""
+"""Variance that kin mistaken for the same add in a leading direction, as a share of their noise."""
 
 SURE = (2.0, 3.0)
 """Standard errors from which differences among kin are believed: all as one, and each."""
@@ -113,15 +113,15 @@ def unlikeness(seen: Evidence, camera: Camera) -> Tensor:
 
 
 def _excess(measured: View, told: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the variance of shapes about their kin beyond the noise, (B, TOLD), and its error (B,).
+    """Return the variance of shapes about their kin beyond the noise, and its error.
 
-    By the medians of the half of the cells that have most kin.
+    (B, TOLD) and (B,); by the medians of the half of the cells that have most kin.
     """
     apart = (measured.shape[..., :TOLD] - told[..., :-1]).flatten(1, 2)
     noise, taken = measured.noise.flatten(1), told[..., -1].flatten(1)
     lit = noise < 10
     typical = taken.masked_fill(~lit, torch.nan).nanmedian(1, keepdim=True).values
-    some = lit & (taken <= typical)
+    some = lit & (taken <= 1.001 * typical)  # in flat areas many have the same
     # A cell is one of its own kin, so it is nearer to them by their noise.
     expected = (noise - taken).clamp_min(1e-9)
     off = (apart.square() / expected[..., None]).masked_fill(~some[..., None], torch.nan)

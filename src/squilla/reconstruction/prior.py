@@ -226,7 +226,14 @@ def hats(bands: int) -> Tensor:
 
 
 def around_knots(bands: int) -> Tensor:
-    """Return the matrix of weighted means of the bands around each knot, (KNOTS, K)."""
+    """Return the matrix of means of the bands around each knot, (KNOTS, K).
+
+    Where bands are fewer than knots, of linear interpolation.
+    """
+    if bands < KNOTS:
+        place = np.linspace(0, bands - 1, KNOTS)
+        each = [np.interp(place, np.arange(bands), unit) for unit in np.eye(bands)]
+        return torch.from_numpy(np.stack(each, 1))
     weight = hats(bands)
     return weight / weight.sum(1, keepdim=True)
 

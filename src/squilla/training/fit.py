@@ -69,9 +69,8 @@ def train(
     ----------
     name : str
         A network of `models`: "mlp", "cnn", "rescnn", "unet", "respecnn"; or "compound", which
-        learns a prior on the camera's wavelengths first, paints scenes of its own and draws every
-        noise (`training.compound`): it takes the number of steps that `count`, `epochs` and
-        `batch` make, `seed`, `device`, `log`, `checkpoint` and `progress`, and refuses the others.
+        learns its prior anew on the camera's wavelengths (`training.prior`) from `count` spectra:
+        it takes `seed`, `device` and `progress` too, and refuses the others.
     calibration : Calibration
         With several field angles, every sample gets one at random.
     noise : None, float, (float, float) or SensorNoise
@@ -140,29 +139,31 @@ def train(
             raise InputError(f"{file} cannot be written: there is no such folder; make it first.")
     if kind.universal:
         from squilla.reconstruction.compound import Compound
-        from squilla.training.prior import learn_prior
+        from squilla.training.prior import LEARNT, learn_prior
 
         own = {
             "noise": noise, "gain_error": gain_error, "dropped": dropped, "spectra": spectra,
-            "fresh": fresh, "learning_rate": learning_rate, "schedule": schedule,
-            "precision": precision, "look": look,
+            "fresh": fresh, "epochs": epochs, "batch": batch, "learning_rate": learning_rate,
+            "schedule": schedule, "precision": precision, "log": log, "checkpoint": checkpoint,
+            "look": look,
         }  # fmt: skip
         usual = signature(train).parameters
         if useless := [key for key, value in own.items() if value != usual[key].default]:
             raise InputError(
-                f"`{name}` draws scenes and noise of its own; leave out {', '.join(useless)}."
+                f"`{name}` learns what spectra look like and nothing of cameras and noise; leave "
+                f"out {', '.join(useless)}."
             )
         with joined(device) as processes:
             if processes.count > 1:
-                raise InputError(f"`{name}` is trained by one process; start it without torchrun.")
-            return train_compound(
-                calibration,
-                Recipe(steps=epochs * math.ceil(count / batch), seed=seed),
-                device=processes.device,
-                log=log,
-                checkpoint=checkpoint,
-                progress=progress,
+                raise InputError(f"`{name}` is learnt by one process; start it without torchrun.")
+            # By default as many as the model that ships has seen.
+            number = LEARNT if count == usual["count"].default else count
+            prior = learn_prior(
+                calibration.wavelength, count=number, seed=seed, device=processes.device
             )
+        model = Compound(calibration, prior).eval()
+        model.provenance = {"count": number, "seed": seed, "clusters": prior.learnt}
+        return model
     samples = Samples(calibration, spectra, count, noise, gain_error, dropped, fresh, seed)
     settings = {
         "noise": _named(noise),

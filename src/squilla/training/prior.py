@@ -1,4 +1,4 @@
-"""What the compound model learns: a prior of spectra, from measured surfaces under measured lamps."""
+"""What the compound model learns: a prior, from spectra of measured surfaces under lamps."""
 
 import numpy as np
 import torch
@@ -12,6 +12,9 @@ from squilla.spectra import CHART_LIGHT, lights, reflectances
 
 HELD_OUT = 8
 """Of so many reflectances and lamps one is kept for judgement, never learnt from."""
+
+LEARNT = 60_000
+"""Spectra from which the model that ships has learnt."""
 
 FEWEST = CORRECTED[-1]
 """Bands that the model cannot do with fewer of."""
@@ -72,7 +75,7 @@ class Palette:
 def learn_prior(
     wavelength: np.ndarray,
     *,
-    count: int = 60_000,
+    count: int = LEARNT,
     seed: int = 0,
     device: torch.device | str = "cpu",
 ) -> Prior:
