@@ -64,17 +64,13 @@ def measured(calibration: Calibration) -> Measurement:
 
 def compound_products(model) -> float:
     """Return the multiply-adds that `compound` needs for a picture."""
-    cells = {4: PIXELS / 16, 2: PIXELS / 4, 1: PIXELS}
     total = PIXELS * 36 * 33 + PIXELS / 2 * 36 * 18  # projections, and the noise
     total += PIXELS * 32 * (32 + 16) + PIXELS / 4 * 32 * (32 + 32)  # linear estimates
     learnt, pieces = model.prior.learnt, len(model.prior.share) - model.prior.learnt
     # The mixture, one cluster taken up, and how near the pieces of the sheet of lines are.
-    total += cells[4] * (32 * (32 * learnt + pieces) + 32 * 64)
-    for side, network in zip((4, 1, 2), model.back.networks(), strict=True):
-        weights = sum(value.numel() for value in network.parameters() if value.ndim > 1)
-        total += cells[side] * weights
+    total += PIXELS / 16 * (32 * (32 * learnt + pieces) + 32 * 64)
     # Spectra at 2 px, mixed from four, changed in 16 coefficients.
-    return total + cells[2] * 64 * BANDS + PIXELS * (4 + 16) * BANDS
+    return total + PIXELS / 4 * 64 * BANDS + PIXELS * (4 + 16) * BANDS
 
 
 def rate() -> float:
@@ -95,36 +91,20 @@ def rows(options: argparse.Namespace) -> dict[str, tuple[Callable[[], object], f
     flat, tilted = cameras()
     whole = PIXELS * BANDS * 4
     seen = measured(flat)
-    result = {}
-    engines = ["torch"]
-    engines += ["openvino", "openvino-bf16"] if find_spec("openvino") else []
-    engines += ["onnxruntime"] if find_spec("onnxruntime") else []
-    for engine in engines:
-        model = load_model("compound", flat, engine=engine)
-        print(f"{model.name}, {engine}: {model.provenance['engine_error']:.1e} from torch")
-        name = f"compound, {engine}"
-        products = compound_products(model)
-        result[name] = lambda model=model: model.reconstruct(seen), products, whole
-    best = engines[1] if len(engines) > 1 else "torch"
-    angular = load_model("compound", tilted, engine=best)
-    result[f"compound by field angle, {best}"] = (
-        lambda: angular.reconstruct(seen),
-        compound_products(angular),
-        whole,
-    )
-    model = load_model("compound", flat, engine=best)
+    model, angular = load_model("compound", flat), load_model("compound", tilted)
+    products = compound_products(model)
+    fewer = products - PIXELS / 4 * 64 * BANDS - PIXELS * 20 * BANDS
     colours = np.random.default_rng(0).random((BANDS, 3))
-    fewer = compound_products(model) - PIXELS / 4 * 64 * BANDS - PIXELS * 20 * BANDS
-    parts = {
-        "three bands": lambda: model.look(seen).bands([50, 125, 200]),
-        "a colour": lambda: model.look(seen).mixed(colours),
-        "100 spectra": lambda: model.look(seen).spectra(list(range(100)), list(range(100))),
+    few = list(range(100))
+    result = {
+        "compound": (lambda: model.reconstruct(seen), products, whole),
+        "compound by field angle": (lambda: angular.reconstruct(seen), products, whole),
+        "only three bands": (lambda: model.look(seen).bands([50, 125, 200]), fewer, PIXELS * 12.0),
+        "only a colour": (lambda: model.look(seen).mixed(colours), fewer, PIXELS * 12.0),
+        "only 100 spectra": (lambda: model.look(seen).spectra(few, few), fewer, BANDS * 400.0),
     }
-    for name, function in parts.items():
-        result[f"only {name}, {best}"] = function, fewer, PIXELS * 12.0
     if options.camera:
-        for engine in engines[1:3] or engines:
-            result |= from_raw(options.camera, engine, products, whole)
+        result |= from_raw(options.camera, products, whole)
     ridge = load_model("ridge", flat)
     result["ridge"] = lambda: ridge.reconstruct(seen), PIXELS * 36 * (36 + BANDS), whole
     if options.network:
@@ -139,7 +119,7 @@ def rows(options: argparse.Namespace) -> dict[str, tuple[Callable[[], object], f
         result[f"respecnn, plain PyTorch, {BATCH} pixels at once"] = (
             batches, PIXELS * RESPECNN, whole,
         )  # fmt: skip
-        for engine in [name for name in ("torch", "openvino", "openvino-bf16") if name in engines]:
+        for engine in ["torch", *(["openvino", "openvino-bf16"] if find_spec("openvino") else [])]:
             network = model_class("respecnn")(flat).eval().with_engine(engine)
             print(f"respecnn, {engine}: {network.provenance['engine_error']:.1e} from torch")
             result[f"respecnn, {engine}"] = (
@@ -150,7 +130,7 @@ def rows(options: argparse.Namespace) -> dict[str, tuple[Callable[[], object], f
     return result
 
 
-def from_raw(path: Path, engine: str, products: float, whole: float):
+def from_raw(path: Path, products: float, whole: float):
     """Return the rows that begin with a raw frame."""
     import squilla
     from squilla.camera.twin import Camera
@@ -158,17 +138,17 @@ def from_raw(path: Path, engine: str, products: float, whole: float):
     calibration = squilla.load_calibration(path)
     generator = torch.Generator().manual_seed(0)
     raw = Camera("thesis").capture(load_scene("chart", grid()), snr=30, generator=generator)
-    model = load_model("compound", calibration, engine=engine)
+    model = load_model("compound", calibration)
     before = squilla.measure(raw, calibration)
 
     def live() -> None:
         model.reconstruct(squilla.measure(raw, calibration, start=before))
 
     return {
-        f"raw frame to cube, {engine}": (
+        "raw frame to cube": (
             lambda: model.reconstruct(squilla.measure(raw, calibration)), products, whole,
         ),
-        f"raw frame to cube, one before known, {engine}": (live, products, whole),
+        "raw frame to cube, one before known": (live, products, whole),
     }  # fmt: skip
 
 

@@ -12,8 +12,7 @@ _WITHIN, BEYOND = 5.0, 3.0
 """How far from its middle a piece of the sheet reaches, in its own variance, and in the noise's."""
 
 QUIETEST = 6
-_NODES = torch.arange(2 * QUIETEST + 3)
-"""Noise variances between which tables are interpolated: 10^-QUIETEST to 10, two to a decade."""
+"""Tables are interpolated between noise variances of 10^-QUIETEST to 10, two to a decade."""
 
 
 class Estimators:
@@ -36,7 +35,9 @@ class Estimators:
 
     def __init__(self, response: Tensor, flat: Tensor, channels: int, prior: Prior):
         seen, amplitude = response @ prior.basis, flat @ prior.basis
-        noise = 10 ** (_NODES.double() / 2 - QUIETEST)
+        nodes = torch.arange(2 * QUIETEST + 3)
+        noise = 10 ** (nodes.double() / 2 - QUIETEST)
+        self.nodes = nodes.float()
         moment = prior.moment * (channels / (seen @ prior.moment @ seen.T).trace())
         power, vectors, gain = _eigen(seen, moment)
         whole = torch.einsum("kc,cd,kd->k", prior.knots, moment, prior.knots)
@@ -118,7 +119,7 @@ class Estimators:
         scores, offset = self.scores[:, own].flatten(1), self.offset[own].flatten()
         score = (shape @ scores - offset).view(count, -1, size)
         scaled = score / (self.cluster_power[own] + noise[:, None, None])
-        node = _between(noise)
+        node = self._between(noise)
         logs = node @ self.log_share[:, own] - (score * scaled).sum(-1) / 2
         if near is not None:
             logs[:, self.learnt :].masked_fill_(~near, -torch.inf)
@@ -141,13 +142,12 @@ class Estimators:
 
     def wiener_variance(self, noise: Tensor) -> Tensor:
         """Return how far the spectrum is from the best linear estimate, (N,) -> (N, KNOTS)."""
-        return _between(noise) @ self.left
+        return self._between(noise) @ self.left
 
-
-def _between(noise: Tensor) -> Tensor:
-    """Return the weights of the nodes for a noise variance, (N,) -> (N, J)."""
-    place = (noise.log10() * 2 + 2 * QUIETEST).clamp(0, len(_NODES) - 1)
-    return torch.relu(1 - (place[:, None] - _NODES.to(noise.device)).abs())
+    def _between(self, noise: Tensor) -> Tensor:
+        """Return the weights of the nodes for a noise variance, (N,) -> (N, J)."""
+        place = (noise.log10() * 2 + 2 * QUIETEST).clamp(0, len(self.nodes) - 1)
+        return torch.relu(1 - (place[:, None] - self.nodes).abs())
 
 
 def _eigen(seen: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -79,12 +79,13 @@ class Camera:
         """(TOLD,), variance of shapes in the leading directions."""
         self.shown = ((prior.knots @ moment @ seen.T) / power).square().T.float()
         """(TOLD, KNOTS), variance of spectra that differ by one in a leading direction."""
+        self.misfits = torch.from_numpy(MISFITS).float()
         self.quiet = vectors[:, -(len(white) // 2) :].float()
         """(M, M // 2), directions that hardly any spectrum reaches: what they see is noise."""
 
     def to(self, device: torch.device | str) -> "Camera":
         """Move everything to a device, in place."""
-        for name in ("project", "power", "shown", "quiet"):
+        for name in ("project", "power", "shown", "misfits", "quiet"):
             setattr(self, name, getattr(self, name).to(device))
         for zone in self.zones:
             zone.to(device)
@@ -360,7 +361,7 @@ def measured_misfit(spectral: View, camera: Camera, zone: Tensor | None) -> Tens
         for misfit in MISFITS.tolist()
     ]
     best = likeliest(torch.stack(likely).clamp(-20, 20).mean((2, 3)))
-    return torch.from_numpy(MISFITS).to(noise)[best][:, None, None]
+    return camera.misfits[best][:, None, None]
 
 
 def likeliest(evidence: Tensor) -> Tensor:

@@ -176,14 +176,9 @@ def fit_prior(
         share.append(parts[0] * len(spectra) / len(everything))
         mean.append(parts[1])
         covariance.append(parts[2])
-    return Prior.with_lines(
-        wavelength,
-        basis,
-        peaked.T @ peaked * (len(basis) / peaked.square().sum()),
-        torch.cat(share),
-        torch.cat(mean),
-        torch.cat(covariance),
-    )
+    moment = peaked.T @ peaked * (len(basis) / peaked.square().sum())
+    learnt = basis, moment, torch.cat(share), torch.cat(mean), torch.cat(covariance)
+    return Prior.with_lines(wavelength, *(values.cpu() for values in learnt))
 
 
 def line_sheet(wavelength: np.ndarray, basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -259,11 +254,12 @@ def fit_mixture(points: Tensor, clusters: int, *, rounds: int = 40) -> tuple[Ten
     centre = direction[:1]
     for _ in range(clusters - 1):
         away = torch.cdist(direction, centre).amin(1).square()
-        centre = torch.cat([centre, direction[torch.multinomial(away, 1, generator=generator)]])
+        chosen = torch.multinomial(away.cpu(), 1, generator=generator)
+        centre = torch.cat([centre, direction[chosen.to(points.device)]])
     belongs = torch.cdist(direction, centre).argmin(1)
     responsible = torch.nn.functional.one_hot(belongs, clusters).double()
     whole = torch.cov(points.T)
-    ridge = 1e-6 * whole.diagonal().mean() * torch.eye(points.shape[1], dtype=points.dtype)
+    ridge = 1e-6 * whole.diagonal().mean() * torch.eye(len(whole)).to(whole)
     share, mean, covariance = responsible.mean(0), points[:clusters], []
     for _ in range(rounds):
         count = responsible.sum(0) + 1e-9
