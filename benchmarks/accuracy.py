@@ -182,6 +182,12 @@ def cases(quick: bool) -> list[Case]:
         angle = torch.full(chart.shape[:2], field)
         y = add_noise(tilted.project(chart, angle), 30, generator)
         rows.append(Case(f"{place} of the field, chart 30 dB", tilted, chart, y, 30, angle))
+    for wrong in (1, 3):
+        off = torch.randn(home.filters, 1, 251, generator=generator)
+        off = functional.avg_pool1d(off, 21, 1, 10)[:, 0]
+        real = home.mean_sensitivity * (1 + wrong / 100 * off / off.std())
+        y = add_noise(chart @ real.float().T, 30, generator)
+        rows.append(Case(f"R wrong by {wrong} %, chart 30 dB", home, chart, y, 30))
     return rows
 
 

@@ -1,4 +1,4 @@
-"""The front end of the compound model on a processor: `evidence` in loops that pass memory once.
+"""The compound model on a processor: `evidence` in loops that pass memory once.
 
 The functions of `evidence` say what is computed; these compute it for one picture at a time, in a
 third of the time, and the tests hold both together.

@@ -1,8 +1,8 @@
 """One model for every camera: exact estimates at several scales, trained by nobody.
 
-A front end (`evidence`) turns the measurement of any calibrated camera into posteriors of the
-coefficients of a fixed basis of spectra, at several scales; each pixel then takes the spectrum of
-its kin, or keeps to itself (`interval`). What was learnt is the prior: what spectra look like.
+The measurement of any calibrated camera becomes posteriors of the coefficients of a fixed basis of
+spectra, at several scales (`evidence`); each pixel then takes the spectrum of its kin, or keeps to
+itself (`interval`). What was learnt is the prior: what spectra look like.
 `docs/compound.md` tells the whole story.
 
 Pictures are (B, H, W, channels); level l has cells of 2^l px.
@@ -193,7 +193,7 @@ class Compound(Reconstructor):
         return y, angle, snr, tuple(kept.tolist())
 
     def _camera(self, channels: tuple[bool, ...] | None, zoned: bool) -> Camera:
-        """Return the front end for some of the channels, (M,), with the mean angle or in zones."""
+        """Return the camera of some of the channels, (M,), with the mean angle or in zones."""
         key = channels or (True,) * self.calibration.filters
         if key not in self._cameras:
             response = self.calibration.mean_sensitivity[list(key)]
@@ -291,7 +291,7 @@ class Compound(Reconstructor):
     def _torch_evidence(
         self, y: Tensor, ratio: Tensor, camera: Camera, zone: Tensor | None, levels: int
     ) -> Evidence:
-        """Return what the front end says of pictures, on any device."""
+        """Gather the evidence of pictures, on any device."""
         height, width = y.shape[1:3]
         if min(height, width) >= SMALLEST:
             ratio = ratio * noise_factor(y, ratio, camera)
@@ -309,7 +309,7 @@ class Compound(Reconstructor):
         zone: Tensor | None,
         interval: bool = False,
     ) -> tuple[Evidence, np.ndarray]:
-        """Return what the front end says of one picture, by loops compiled for a processor.
+        """Gather the evidence of one picture, by loops compiled for a processor.
 
         And what brightness is multiplied by: 1 where there was light, 0 where there was none, NaN
         where y is not finite.

@@ -1,4 +1,4 @@
-"""The front end of the compound model: from any camera's measurement to posteriors of spectra.
+"""The heart of the compound model: from any camera's measurement to posteriors of spectra.
 
 Nobody trained it. A measurement is divided by its amplitude and projected onto the directions that
 spectra reach. Cells of growing size average what, at the known noise, shows the same spectrum; the
@@ -44,7 +44,7 @@ SAMPLE = 8
 
 
 class Camera:
-    """What the front end must know of a camera.
+    """What the model must know of a camera.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def _interleaved(phases: list[Tensor]) -> Tensor:
 
 @dataclass
 class Evidence:
-    """Everything that the front end finds, of the same size for every camera.
+    """Everything that a measurement tells, of the same size for every camera.
 
     coefficients : (B, H, W, C) at the level SPECTRAL, posterior mean.
     variance : (B, H, W, KNOTS) there, of the spectrum at the knots.

@@ -143,7 +143,7 @@ class Prior:
 
 @cache
 def broad_prior() -> Prior:
-    """Return the prior that ships, on 500-750 nm; `experiments/train_compound.py` makes it."""
+    """Return the prior that ships, on 500-750 nm; `experiments/learn_compound.py` makes it."""
     from safetensors import safe_open
 
     path = package_files("squilla") / "data" / "weights" / "compound.safetensors"
