@@ -282,6 +282,8 @@ def test_a_scheduler_that_is_no_address_is_said_to_be_none(night, tmp_path):
         reconstruct_all(
             list_frames(night / "raw"), recipe(night), tmp_path / "o.zarr", scheduler="nowhere"
         )
+    # and nothing that is worked out later asks there
+    assert float(xr.DataArray(np.ones(4)).chunk(2).sum()) == 4
 
 
 @pytest.mark.slow

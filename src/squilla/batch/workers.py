@@ -93,7 +93,7 @@ def _cluster(scheduler: str) -> Iterator[Crew]:
             "A scheduler needs Dask; install it with: pip install 'squilla[batch]'."
         ) from error
     try:
-        client: Any = Client(scheduler, timeout=20)
+        client: Any = Client(scheduler, timeout=20, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(f"No Dask scheduler answers at {scheduler}: {error}") from error
     with client:
