@@ -125,6 +125,7 @@ def settled(rough: np.ndarray, believed: np.ndarray, picture: np.ndarray) -> np.
     to the nearer side, so that a surface is at most as near as its edges: points that would draw it
     nearer hardly count.
     """
+    picture = gaussian_filter(picture, 0.6)
     bonds = [np.exp(-np.abs(np.diff(picture, axis=axis)) / _CONTRAST) for axis in (1, 0)]
     along, down = (np.ascontiguousarray(bond, np.float32) for bond in (bonds[0], bonds[1].T))
     weight = believed = (believed + 1e-5).astype(np.float32)
