@@ -147,11 +147,11 @@ def find_depth(
     if is_relief(cost, planes, rough, usual):
         believed = trusted(rough, evidence)
         picture, grain = _picture(views, lattice, noise, level, rough)
-        areas = plain_areas(picture, grain)
-        filled, believed = fill_plain(
-            rough, believed, evidence, cost, planes, usual, *areas, lattice.focal
-        )
-        disparity = settled(filled, believed, picture)
+        filled, believed, areas = fill_plain(
+            rough, believed, evidence, cost, planes, usual, plain_areas(picture, grain),
+            lattice.focal,
+        )  # fmt: skip
+        disparity = settled(filled, believed, picture, areas)
     else:
         rough = disparity = usual.astype(np.float32)
     # Cramer-Rao: a unit tells of a shift by its slope across the noise, of disparity by its

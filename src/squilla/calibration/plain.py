@@ -18,7 +18,7 @@ _SMOOTH, _ABOVE = 1.35, 4.5
 _FAINT = 15.0
 """Evidence beyond which half of an area's points can speak for themselves."""
 
-_FEW = 40
+_FEW = 250
 """Points below which an area is left to its neighbours."""
 
 _INSIDE, _OUTSIDE = 2, 5
@@ -33,7 +33,7 @@ _CLEAR, _SURE = 0.002, 0.08
 _ASIDE = 0.6
 """Disparity beside the best by which a true one stands out, px per pitch: the width of edges."""
 
-_LEAN = 0.3
+_LEAN = 0.5
 """Slant that a plain area is expected to have: distance per breadth."""
 
 _WORTH = 15.0
@@ -93,10 +93,9 @@ def fill_plain(
     cost: np.ndarray,
     planes: np.ndarray,
     usual: np.ndarray,
-    areas: np.ndarray,
-    whole: np.ndarray,
+    found: tuple[np.ndarray, np.ndarray],
     focal: float,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Give every plain area one plane of disparity.
 
     Parameters
@@ -109,8 +108,8 @@ def fill_plain(
         Of every disparity in `planes`.
     usual : array, (H, W)
         Disparity to assume where nothing bounds an area.
-    areas, whole : array, (H, W) int
-        From `plain_areas`.
+    found : two arrays, (H, W) int
+        What `plain_areas` found.
     focal : float
         px.
 
@@ -118,17 +117,19 @@ def fill_plain(
     -------
     rough, believed : array, (H, W)
         Filled; areas in which faint texture suffices point by point stay as they are.
+    areas : array, (H, W) int32
+        Number of the filled area that a point is in; 0 in none.
     """
-    plain = []
+    (areas, whole), plain = found, []
     for number, place in enumerate(find_objects(whole), 1):
         around = tuple(slice(max(side.start - _RIM, 0), side.stop + _RIM) for side in place)
         clear = binary_erosion(areas[around] == number, iterations=_INSIDE, border_value=1)
         if clear.sum() >= _FEW and np.median(evidence[around][clear]) < _FAINT:
             plain.append((around, clear, whole[around] == number))
-    filled, trust = rough.copy(), believed.astype(np.float32)
-    for around, _, inside in plain:
-        trust[around][inside] = 0
-    bounding = trust > _STEADY
+    filled, trust, areas = rough.copy(), believed.astype(np.float32), np.zeros_like(whole)
+    for number, (around, _, inside) in enumerate(plain, 1):
+        areas[around][inside] = number
+    bounding = (trust > _STEADY) & (areas == 0)
     for around, clear, inside in plain:
         frame = _frame(inside)
         ramps = _ramps(inside, frame)
@@ -145,7 +146,7 @@ def fill_plain(
                 behind = bounding_plane(bounds, _ramps(rim, frame)) @ ramps
                 plane = np.clip(behind, bounds.min(), bounds.max())
         filled[around][inside], trust[around][inside] = plane, 1
-    return filled, trust
+    return filled, trust, areas
 
 
 def told_plane(
