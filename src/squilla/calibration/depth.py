@@ -152,6 +152,7 @@ def find_depth(
             lattice.focal,
         )  # fmt: skip
         disparity = settled(filled, believed, picture, areas)
+        evidence[areas > 0] = 0  # whose rims show the edge around, not themselves
     else:
         rough = disparity = usual.astype(np.float32)
     # Cramer-Rao: a unit tells of a shift by its slope across the noise, of disparity by its
