@@ -147,12 +147,12 @@ def find_depth(
     if is_relief(cost, planes, rough, usual):
         believed = trusted(rough, evidence)
         picture, grain = _picture(views, lattice, noise, level, rough)
-        filled, believed, areas = fill_plain(
-            rough, believed, evidence, cost, planes, usual, plain_areas(picture, grain),
-            lattice.focal,
-        )  # fmt: skip
-        disparity = settled(filled, believed, picture, areas)
-        evidence[areas > 0] = 0  # whose rims show the edge around, not themselves
+        areas = plain_areas(picture, grain, evidence)
+        rough, believed, filled = fill_plain(
+            rough, believed, cost, planes, usual, areas, lattice.focal
+        )
+        disparity = settled(rough, believed, picture, filled)
+        evidence[filled > 0] = 0  # whose rims show the edge around, not themselves
     else:
         rough = disparity = usual.astype(np.float32)
     # Cramer-Rao: a unit tells of a shift by its slope across the noise, of disparity by its

@@ -5,24 +5,23 @@ may, for faint texture adds up. Where it does not, the area lies behind the edge
 way it reaches up to where the picture is steepest, however far the evidence of that edge spreads.
 """
 
+from dataclasses import dataclass
+
 import numba
 import numpy as np
-from scipy.ndimage import (
-    binary_dilation, binary_erosion, binary_opening, find_objects,
-    gaussian_gradient_magnitude, label,
-)  # fmt: skip
+from scipy import ndimage
 
 _SMOOTH, _ABOVE = 1.35, 4.5
 """Smoothing of the picture's gradient, px, and how many times its noise a plain point may have."""
 
 _FAINT = 15.0
-"""Evidence beyond which half of an area's points can speak for themselves."""
+"""Median evidence from which on an area's points can speak for themselves."""
 
 _FEW = 250
-"""Points below which an area is left to its neighbours."""
+"""Clear points below which an area is left to its neighbours."""
 
-_INSIDE, _OUTSIDE = 2, 5
-"""How far from an area's border edges blur into it, and how far the edge itself may be, px."""
+_BLUR, _EDGE = 2, 5
+"""How far edges blur into an area, and how far outside of it they may lie, px."""
 
 _RIM, _STEADY = 6, 0.3
 """How far around an area its bounds lie, px, and the belief that such a point needs."""
@@ -46,7 +45,21 @@ _FLAT = 0.3
 """Price of a slant, squared, for a step from one bound to the other may look like one."""
 
 
-def plain_areas(picture: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+@dataclass(frozen=True)
+class Area:
+    """An area in which the picture shows next to nothing.
+
+    around : rows and columns of the part of the picture that it and its bounds lie in.
+    clear : (h, w) bool, there; points that no edge blurs into.
+    whole : (h, w) bool; up to the edges around.
+    """
+
+    around: tuple[slice, slice]
+    clear: np.ndarray
+    whole: np.ndarray
+
+
+def plain_areas(picture: np.ndarray, noise: float, evidence: np.ndarray) -> list[Area]:
     """Find where the picture shows nothing but noise and faint shading.
 
     Parameters
@@ -54,22 +67,25 @@ def plain_areas(picture: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarr
     picture : array, (H, W)
     noise : float
         Standard deviation of its white noise.
-
-    Returns
-    -------
-    areas : array, (H, W) int32
-        Number of the area that a point is in, from 1; 0 in none.
-    whole : array, (H, W) int32
-        The same with every area grown uphill to the edge around it.
+    evidence : array, (H, W)
+        Energy that the units share at each point, in that of the noise. Areas where it suffices
+        point by point are none.
     """
-    steep = gaussian_gradient_magnitude(picture, _SMOOTH)
+    steep = ndimage.gaussian_gradient_magnitude(picture, _SMOOTH)
     of_noise = noise / np.sqrt(8 * np.pi) / _SMOOTH**2  # along one axis
-    areas = np.empty(picture.shape, np.int32)
-    label(binary_opening(steep < _ABOVE * of_noise, np.ones((3, 3))), output=areas)
-    whole = areas.copy()
-    for _ in range(_OUTSIDE):
+    flat = np.empty(picture.shape, np.int32)
+    ndimage.label(ndimage.binary_opening(steep < _ABOVE * of_noise, np.ones((3, 3))), output=flat)
+    whole = flat.copy()
+    for _ in range(_EDGE):
         _climb(whole.copy(), steep, whole)
-    return areas, whole
+    areas = []
+    for number, place in enumerate(ndimage.find_objects(whole), 1):
+        rows, columns = (slice(max(side.start - _RIM, 0), side.stop + _RIM) for side in place)
+        around, inside = (rows, columns), flat[rows, columns] == number
+        clear = np.asarray(ndimage.binary_erosion(inside, iterations=_BLUR, border_value=1), bool)
+        if clear.sum() >= _FEW and np.median(evidence[around][clear]) < _FAINT:
+            areas.append(Area(around, clear, whole[around] == number))
+    return areas
 
 
 @numba.njit(cache=True)
@@ -78,22 +94,22 @@ def _climb(areas, steep, grown):
     rows, columns = areas.shape
     for row in range(rows):
         for column in range(columns):
-            if areas[row, column]:
-                continue
             low = steep[row, column]
-            for y, x in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
-                if 0 <= y < rows and 0 <= x < columns and areas[y, x] and steep[y, x] <= low:
+            for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                y, x = row + down, column + right
+                if areas[row, column] or not (0 <= y < rows and 0 <= x < columns):
+                    continue
+                if areas[y, x] and steep[y, x] <= low:
                     low, grown[row, column] = steep[y, x], areas[y, x]
 
 
 def fill_plain(
     rough: np.ndarray,
     believed: np.ndarray,
-    evidence: np.ndarray,
     cost: np.ndarray,
     planes: np.ndarray,
     usual: np.ndarray,
-    found: tuple[np.ndarray, np.ndarray],
+    areas: list[Area],
     focal: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Give every plain area one plane of disparity.
@@ -102,51 +118,43 @@ def fill_plain(
     ----------
     rough, believed : array, (H, W)
         Disparities, px per pitch, and how much each counts, 0..1.
-    evidence : array, (H, W)
-        Energy that the units share at each point, in that of the noise.
     cost : array, (H, W, D)
         Of every disparity in `planes`.
     usual : array, (H, W)
         Disparity to assume where nothing bounds an area.
-    found : two arrays, (H, W) int
-        What `plain_areas` found.
+    areas : list of Area
     focal : float
         px.
 
     Returns
     -------
     rough, believed : array, (H, W)
-        Filled; areas in which faint texture suffices point by point stay as they are.
-    areas : array, (H, W) int32
-        Number of the filled area that a point is in; 0 in none.
+        Filled.
+    filled : array, (H, W) int32
+        Number of the area that a point is in, from 1; 0 in none.
     """
-    (areas, whole), plain = found, []
-    for number, place in enumerate(find_objects(whole), 1):
-        around = tuple(slice(max(side.start - _RIM, 0), side.stop + _RIM) for side in place)
-        clear = binary_erosion(areas[around] == number, iterations=_INSIDE, border_value=1)
-        if clear.sum() >= _FEW and np.median(evidence[around][clear]) < _FAINT:
-            plain.append((around, clear, whole[around] == number))
-    filled, trust, areas = rough.copy(), believed.astype(np.float32), np.zeros_like(whole)
-    for number, (around, _, inside) in enumerate(plain, 1):
-        areas[around][inside] = number
-    bounding = (trust > _STEADY) & (areas == 0)
-    for around, clear, inside in plain:
-        frame = _frame(inside)
-        ramps = _ramps(inside, frame)
-        lean = _LEAN * frame[2] / focal
-        plane = told_plane(cost[around][clear], _ramps(clear, frame), planes, lean)
+    rough, believed = rough.copy(), believed.astype(np.float32)
+    filled = np.zeros(rough.shape, np.int32)
+    for number, area in enumerate(areas, 1):
+        filled[area.around][area.whole] = number
+    bounding = (believed > _STEADY) & (filled == 0)
+    for area in areas:
+        around, whole, frame = area.around, area.whole, _frame(area.whole)
+        ramps = _ramps(whole, frame)
+        plane = told_plane(
+            cost[around][area.clear], _ramps(area.clear, frame), planes, _LEAN * frame[2] / focal
+        )
         if plane is not None:
-            plane = plane @ ramps
+            disparity = plane @ ramps
         else:
-            near = np.asarray(binary_dilation(inside, iterations=_RIM), bool)
-            rim = near & bounding[around]
-            bounds = rough[around][rim]
-            plane = usual[around][inside]
+            rim = np.asarray(ndimage.binary_dilation(whole, iterations=_RIM), bool)
+            rim &= bounding[around]
+            bounds, disparity = rough[around][rim], usual[around][whole]
             if len(bounds) > 3:
                 behind = bounding_plane(bounds, _ramps(rim, frame)) @ ramps
-                plane = np.clip(behind, bounds.min(), bounds.max())
-        filled[around][inside], trust[around][inside] = plane, 1
-    return filled, trust, areas
+                disparity = np.clip(behind, bounds.min(), bounds.max())
+        rough[around][whole], believed[around][whole] = disparity, 1
+    return rough, believed, filled
 
 
 def told_plane(
