@@ -82,8 +82,9 @@ def plain_areas(picture: np.ndarray, noise: float, evidence: np.ndarray) -> list
     for number, place in enumerate(ndimage.find_objects(whole), 1):
         rows, columns = (slice(max(side.start - _RIM, 0), side.stop + _RIM) for side in place)
         around, inside = (rows, columns), flat[rows, columns] == number
-        clear = np.asarray(ndimage.binary_erosion(inside, iterations=_BLUR, border_value=1), bool)
-        if clear.sum() >= _FEW and np.median(evidence[around][clear]) < _FAINT:
+        inner = np.asarray(ndimage.binary_erosion(inside, iterations=_BLUR, border_value=1), bool)
+        clear = inner & (evidence[around] < _FAINT)
+        if clear.sum() >= max(_FEW, inner.sum() / 2):
             areas.append(Area(around, clear, whole[around] == number))
     return areas
 
