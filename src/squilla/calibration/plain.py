@@ -15,13 +15,14 @@ _SMOOTH, _ABOVE = 1.35, 4.5
 """Smoothing of the picture's gradient, px, and how many times its noise a plain point may have."""
 
 _FAINT = 15.0
-"""Median evidence from which on an area's points can speak for themselves."""
+"""Evidence that suffices for a point to speak for itself."""
 
-_FEW = 250
-"""Clear points below which an area is left to its neighbours."""
+_BLUR, _FAR, _EDGE = 2, 5, 5
+"""How far edges blur into an area, px, and strong ones where only sums tell; and how far outside of
+it they may lie."""
 
-_BLUR, _EDGE = 2, 5
-"""How far edges blur into an area, and how far outside of it they may lie, px."""
+_FEW, _MANY = 250, 1200
+"""Clear points below which an area is left to its neighbours, and how many may well suffice."""
 
 _RIM, _STEADY = 6, 0.3
 """How far around an area its bounds lie, px, and the belief that such a point needs."""
@@ -82,11 +83,24 @@ def plain_areas(picture: np.ndarray, noise: float, evidence: np.ndarray) -> list
     for number, place in enumerate(ndimage.find_objects(whole), 1):
         rows, columns = (slice(max(side.start - _RIM, 0), side.stop + _RIM) for side in place)
         around, inside = (rows, columns), flat[rows, columns] == number
-        inner = np.asarray(ndimage.binary_erosion(inside, iterations=_BLUR, border_value=1), bool)
-        clear = inner & (evidence[around] < _FAINT)
-        if clear.sum() >= max(_FEW, inner.sum() / 2):
-            areas.append(Area(around, clear, whole[around] == number))
+        if inside.sum() >= _FEW:
+            clear = _clear(inside, evidence[around])
+            if clear.sum() >= _FEW:
+                areas.append(Area(around, clear, whole[around] == number))
     return areas
+
+
+def _clear(inside: np.ndarray, evidence: np.ndarray) -> np.ndarray:
+    """Return the points of an area that no edge blurs into; none if most speak for themselves.
+
+    An area with points to spare keeps away from its edges so far that even the sum of all of its
+    border tells nothing of them.
+    """
+    silent = inside & (evidence < _FAINT)
+    away = np.asarray(ndimage.distance_transform_edt(np.pad(inside, 1, mode="edge")))[1:-1, 1:-1]
+    spared = np.sort(away[silent])[-_MANY:]
+    inner = away > np.clip(spared.min(initial=np.inf), _BLUR, _FAR)
+    return silent & inner & (2 * silent[inner].sum() >= inner.sum())
 
 
 @numba.njit(cache=True)
