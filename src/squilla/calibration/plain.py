@@ -1,7 +1,8 @@
 """Plain areas: what all their points tell together, and else what bounds them.
 
 Where a surface has next to no texture no single point tells its distance. All the points of an area
-may, for faint texture adds up. Where it does not, the area lies behind the edges around it. Either
+may, for faint texture adds up, and so does what is left of its edges two pixels inside: of a small
+area that is part of the sum. Where nothing adds up, the area lies behind the edges around it. Either
 way it reaches up to where the picture is steepest, however far the evidence of that edge spreads.
 """
 
@@ -93,8 +94,8 @@ def plain_areas(picture: np.ndarray, noise: float, evidence: np.ndarray) -> list
 def _clear(inside: np.ndarray, evidence: np.ndarray) -> np.ndarray:
     """Return the points of an area that no edge blurs into; none if most speak for themselves.
 
-    An area with points to spare keeps away from its edges so far that even the sum of all of its
-    border tells nothing of them.
+    An area with points to spare keeps away from its edges so far that even the sum over its whole
+    border tells nothing of them: a wall lies behind them. A small thing has them for its own.
     """
     silent = inside & (evidence < _FAINT)
     away = np.asarray(ndimage.distance_transform_edt(np.pad(inside, 1, mode="edge")))[1:-1, 1:-1]
