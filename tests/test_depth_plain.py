@@ -115,6 +115,20 @@ def test_what_each_point_can_tell_is_not_plain():
     assert not plain.plain_areas(picture, 0.02, np.full(disc.shape, 100.0))
 
 
+@pytest.mark.parametrize(("side", "apart"), [(80, 5), (30, 2)])
+def test_areas_keep_as_far_from_edges_as_they_can_afford(side, apart):
+    inside = np.zeros((100, 100), bool)
+    inside[8 : 8 + side, 8 : 8 + side] = True
+    picture = np.where(inside, 0.5, np.random.default_rng(2).uniform(0, 2, inside.shape))
+    (area,) = plain.plain_areas(picture, 0.001, np.zeros(inside.shape))
+    rows, columns = (np.nonzero(area.clear)[axis] + area.around[axis].start for axis in (0, 1))
+    nearest = min(
+        rows.min() - 8, columns.min() - 8, 7 + side - rows.max(), 7 + side - columns.max()
+    )
+    blur = 4 * 1.35  # of the picture's gradient, in which SciPy cuts the Gaussian
+    assert apart + 1 <= nearest <= apart + blur + 2
+
+
 def test_only_plain_areas_are_filled():
     """A silent disc on a wall takes the wall's disparity, and not that of its nearer half rim."""
     disc, picture = disc_before(noise=0.02)
@@ -134,6 +148,17 @@ def test_only_plain_areas_are_filled():
     assert (trust[inside] == 1).all()
     np.testing.assert_array_equal(found[~inside], rough[~inside])
     np.testing.assert_array_equal(trust[~inside], believed[~inside].astype(np.float32))
+
+
+def test_nothing_settles_across_the_border_of_an_area():
+    """Both sides look alike; yet what is believed on one side says nothing on the other."""
+    areas = np.zeros((30, 40), int)
+    areas[8:22, 10:30] = 1
+    rough = np.where(areas, 3.0, 2.0)
+    believed = np.where(areas, 1.0, 0.0)
+    believed[:4] = 1.0
+    found = surfaces.settled(rough, believed, np.ones(areas.shape), areas)
+    np.testing.assert_allclose(found, rough, atol=1e-3)
 
 
 def test_a_climb_between_surfaces_hardly_counts():

@@ -323,7 +323,7 @@ def _sweep(
 def _picture(
     views: "SubImages", lattice: Lattice, noise: np.ndarray, level: np.ndarray, rough: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return what the units nearest to the reference see in the mean, (H, W), about 1.
+    """Return what the units nearest to the reference see together, (H, W), about 1.
 
     Also the standard deviation of its noise.
     """
@@ -334,5 +334,5 @@ def _picture(
         lattice.places(views.margin + views.offset)[near], lattice.baseline[near], rough, CUBIC,
         values, np.empty(values.shape[1:], bool),
     )  # fmt: skip
-    grain = np.sqrt((noise[near] / level[near] ** 2).sum()) / near.sum()
-    return (values[0] / level[near, None, None]).mean(0), float(grain)
+    light = level[near].sum()
+    return values[0].sum(0) / light, float(np.sqrt(noise[near].sum()) / light)

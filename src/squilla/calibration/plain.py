@@ -1,9 +1,9 @@
 """Plain areas: what all their points tell together, and else what bounds them.
 
 Where a surface has next to no texture no single point tells its distance. All the points of an area
-may, for faint texture adds up, and so does what is left of its edges two pixels inside: of a small
-area that is part of the sum. Where nothing adds up, the area lies behind the edges around it. Either
-way it reaches up to where the picture is steepest, however far the evidence of that edge spreads.
+may, for faint texture adds up, and so does what is left of its edges two pixels inside: in a small
+area that is part of the sum. Where nothing adds up, the area lies behind the edges around it. Both
+ways it reaches up to where the picture is steepest, however far the evidence of that edge spreads.
 """
 
 from dataclasses import dataclass

@@ -125,7 +125,7 @@ def settled(
     Minimises sum w (d - rough)^2 + sum a (d_p - d_q)^2 over neighbours, a falling with their
     contrast, in turns: each point then counts by how well it agreed. An edge in the picture belongs
     to the nearer side, so that a surface is at most as near as its edges: points that would draw it
-    nearer hardly count.
+    nearer hardly count. Nothing crosses the border of one of the numbered `areas`, (H, W) int.
     """
     picture = gaussian_filter(picture, 0.6)
     bonds = [
