@@ -426,7 +426,7 @@ def main() -> None:
         calibration = squilla.load_calibration(given.calibration)
     else:
         calibration = Rehearsal(camera, step=5.0, bandwidth=5.0).calibrate()
-    scenes = {f"doll {seed}": (solid_scene, {"seed": seed}) for seed in (11,)}
+    scenes = {f"doll {seed}": (solid_scene, {"seed": seed}) for seed in (11, 12)}
     scenes |= {f"layers {seed}": (layers_scene, {"seed": seed}) for seed in (11, 12)}
     cells = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     cells["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"

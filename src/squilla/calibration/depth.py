@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+from scipy.ndimage import maximum_filter, minimum_filter
 from torch import Tensor
 
 from squilla.calibration.calibration import Lattice
-from squilla.calibration.plain import fill_plain
+from squilla.calibration.plain import fill_plain, plain_areas
 from squilla.calibration.resample import CUBIC, SINC, resample
 from squilla.calibration.surfaces import is_relief, lowest, settled, smoothed, trusted, unhidden
 
@@ -146,8 +146,13 @@ def find_depth(
     rough = lowest(smoothed(cost, evidence), planes)
     if is_relief(cost, planes, rough, usual):
         believed = trusted(rough, evidence)
-        filled, believed = fill_plain(rough, believed, evidence, cost, planes, usual)
-        disparity = settled(filled, believed, _picture(views, lattice, level, rough))
+        picture, grain = _picture(views, lattice, noise, level, rough)
+        areas = plain_areas(picture, grain, evidence)
+        rough, believed, filled = fill_plain(
+            rough, believed, cost, planes, usual, areas, lattice.focal
+        )
+        disparity = settled(rough, believed, picture, filled)
+        evidence[filled > 0] = 0  # whose rims show the edge around, not themselves
     else:
         rough = disparity = usual.astype(np.float32)
     # Cramer-Rao: a unit tells of a shift by its slope across the noise, of disparity by its
@@ -316,9 +321,12 @@ def _sweep(
 
 
 def _picture(
-    views: "SubImages", lattice: Lattice, level: np.ndarray, rough: np.ndarray
-) -> np.ndarray:
-    """Return what the units nearest to the reference see in the mean, (H, W), about 1."""
+    views: "SubImages", lattice: Lattice, noise: np.ndarray, level: np.ndarray, rough: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return what the units nearest to the reference see together, (H, W), about 1.
+
+    Also the standard deviation of its noise.
+    """
     near = np.abs(lattice.baseline).max(1) < 1.5
     values = np.empty((1, near.sum(), *lattice.field), np.float32)
     resample(
@@ -326,4 +334,5 @@ def _picture(
         lattice.places(views.margin + views.offset)[near], lattice.baseline[near], rough, CUBIC,
         values, np.empty(values.shape[1:], bool),
     )  # fmt: skip
-    return gaussian_filter((values[0] / level[near, None, None]).mean(0), 0.6)
+    light = level[near].sum()
+    return values[0].sum(0) / light, float(np.sqrt(noise[near].sum()) / light)

@@ -117,15 +117,21 @@ def trusted(rough: np.ndarray, evidence: np.ndarray) -> np.ndarray:
     return np.clip(evidence / ENOUGH, 0, 1) / (1 + (slope / _STEEP) ** 2) ** 2
 
 
-def settled(rough: np.ndarray, believed: np.ndarray, picture: np.ndarray) -> np.ndarray:
+def settled(
+    rough: np.ndarray, believed: np.ndarray, picture: np.ndarray, areas: np.ndarray
+) -> np.ndarray:
     """Smooth a disparity map within the surfaces that the picture shows.
 
     Minimises sum w (d - rough)^2 + sum a (d_p - d_q)^2 over neighbours, a falling with their
     contrast, in turns: each point then counts by how well it agreed. An edge in the picture belongs
     to the nearer side, so that a surface is at most as near as its edges: points that would draw it
-    nearer hardly count.
+    nearer hardly count. Nothing crosses the border of one of the numbered `areas`, (H, W) int.
     """
-    bonds = [np.exp(-np.abs(np.diff(picture, axis=axis)) / _CONTRAST) for axis in (1, 0)]
+    picture = gaussian_filter(picture, 0.6)
+    bonds = [
+        np.exp(-np.abs(np.diff(picture, axis=axis)) / _CONTRAST) * (np.diff(areas, axis=axis) == 0)
+        for axis in (1, 0)
+    ]
     along, down = (np.ascontiguousarray(bond, np.float32) for bond in (bonds[0], bonds[1].T))
     weight = believed = (believed + 1e-5).astype(np.float32)
     for _ in range(6):
