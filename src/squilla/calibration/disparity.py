@@ -206,7 +206,7 @@ def compare(
     """
     shape, grid, corner, scale = _grid(lattice.field, edges.step)
     place = lattice.places(first)
-    place[..., 0] += corner
+    place[..., 0] += np.array(corner) - edges.corner
     place = place * scale / edges.step
     units, points = len(first), shape[0] * shape[1]
     values = np.empty((units, 2, *shape), np.float32)
