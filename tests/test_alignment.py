@@ -136,6 +136,20 @@ def test_the_frame_before_spares_the_search():
     np.testing.assert_allclose(warm.plane, cold.plane, atol=0.004)
 
 
+@pytest.mark.parametrize("distance", [90.0, 290.0, 1000.0])
+def test_a_scene_that_jumped_is_found(camera, calibration, scene, distance):
+    """The frame before may help, but never decides: wherever it lay, the same is found."""
+    raw = camera.capture(
+        scene, distance=distance, snr=30, generator=torch.Generator().manual_seed(3)
+    )
+    cold = measure(raw, calibration)
+    for before in (0.0, 0.2, 0.6, 1.2, 2.1, 4.0):
+        start = replace(cold, disparity=torch.full_like(cold.disparity, before))
+        warm = measure(raw, calibration, start=start)
+        assert warm.provenance["alignment"] == "from the scene"
+        assert (warm.disparity - cold.disparity).abs().max() < 0.02
+
+
 def test_units_beside_their_places_are_found():
     lattice, plane = array(), np.array([3.0, 0.05, 0.1])
     views = capture(lattice, plane, colours=1)

@@ -167,7 +167,8 @@ def measure(
         plane, offset, quality = place(
             even, lattice, largest, noise=noise, start=before, refine=refine
         )
-        if before is not None and np.abs(plane - before).sum() > _DRIFT:
+        placed = quality["alignment"] == "from the scene"
+        if before is not None and not (placed and np.abs(plane - before).sum() < _DRIFT):
             return measure(raw, calibration, nearest=nearest, refine=refine)  # another scene
         views = replace(views, offset=views.offset + offset)
         disparity = plane_map(plane, lattice).astype(np.float32)
