@@ -20,7 +20,6 @@ from squilla.calibration.residual import relief, score, single_shifts
 _STEEP = 0.1
 """Slope that planes are expected to have, of their disparity: 40 degrees in the thesis' camera."""
 
-
 _RANK = 6
 """Most pictures that the gradients of all units are taken to be mixed from.
 
@@ -29,7 +28,7 @@ such differences would look like shifts.
 """
 
 _NEAR = 0.02
-"""Last change of a shift from which on Gauss-Newton steps end, px; they converge quadratically."""
+"""Last change of a shift from which on Gauss-Newton steps end, px; each leaves some 5 % of it."""
 
 _ROUGHLY = 0.2
 """The same where the steps go on with finer edges, px."""

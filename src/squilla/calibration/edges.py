@@ -19,10 +19,16 @@ _BELL_WIDTH = 2
 
 _REACH = 3 * _BELL_WIDTH
 
-_BELL = np.exp(-((np.arange(_REACH + 1) / _BELL_WIDTH) ** 2) / 2)
-_SLOPE = (np.arange(_REACH + 1) * _BELL / (2 * np.arange(_REACH + 1) ** 2 @ _BELL)).astype("f4")
-_BELL = (_BELL / (2 * _BELL.sum() - 1)).astype("f4")
-"""Half of the taps of a Gaussian and of its slope, from the middle on, both of unit response."""
+
+def _half_taps() -> tuple[np.ndarray, np.ndarray]:
+    """Return the taps of a Gaussian and of its slope from the middle on, both of unit response."""
+    tap = np.arange(_REACH + 1)
+    bell = np.exp(-((tap / _BELL_WIDTH) ** 2) / 2)
+    slope = tap * bell / (2 * tap**2 @ bell)
+    return (bell / (2 * bell.sum() - 1)).astype(np.float32), slope.astype(np.float32)
+
+
+_BELL, _SLOPE = _half_taps()
 
 _CLEAR = 100.0
 """Power of gradients over that of their noise from which on more smoothing only loses detail."""

@@ -36,6 +36,7 @@ class Aligned:
     values : (M, 2 P); along x, then along y.
     spread : (M,), standard deviation of their noise.
     halves : two of (M, M), inner products of `values` over each half of the field.
+    products : (M, M), inner products of values / spread.
     share : (M, R), orthonormal: values / spread are about share @ pictures.
     rest : (M, M), inverse covariance of values / spread about the first picture.
     slopes : (R, 2, 2 P) of the pictures along y and x, 1/px.
@@ -47,6 +48,7 @@ class Aligned:
     values: np.ndarray
     spread: np.ndarray
     halves: list[np.ndarray]
+    products: np.ndarray
     share: np.ndarray
     rest: np.ndarray
     slopes: np.ndarray
@@ -54,16 +56,11 @@ class Aligned:
     baseline: np.ndarray
     shared: float
 
-    @property
-    def products(self) -> np.ndarray:
-        """Inner products of the units' values in units of their noise, (M, M)."""
-        return sum(self.halves) / np.outer(self.spread, self.spread)
-
     @cached_property
     def of_disparity(self) -> tuple[np.ndarray, np.ndarray]:
-        """What each point says of its disparity, (h, w).
+        """What each point says of its disparity: two of (h, w).
 
-        The slope of the log likelihood and its curvature, in 1 and 1 over (px per pitch)^2.
+        The slope of the log likelihood, 1/(px per pitch), and its curvature, that squared.
         """
         rank = self.share.shape[1]
         along = (self.baseline.T[None] * self.share.T[:, None]).reshape(2 * rank, -1)
@@ -71,11 +68,12 @@ class Aligned:
         slopes = self.slopes.reshape(2 * rank, -1)
         misfit = product(weighted / self.spread, self.values.T)
         change = product(weighted @ along.T, slopes.T)
-        return tuple(
-            np.einsum("rp,rp->p", each, slopes).reshape(2, *self.grid.shape[1:]).sum(0)
-            / np.float32(self.shared)
-            for each in (-misfit, change)
-        )
+
+        def total(each: np.ndarray) -> np.ndarray:
+            at_points = np.einsum("rp,rp->p", each, slopes) / np.float32(self.shared)
+            return at_points.reshape(2, *self.grid.shape[1:]).sum(0)
+
+        return -total(misfit), total(change)
 
     def of_units(self, terms: int) -> tuple[np.ndarray, np.ndarray]:
         """Return what all points say of each unit's displacement.
@@ -130,7 +128,7 @@ def unmix(
         _fill_in(values, seen)
     halves = _products(values)
     values = values.reshape(units, count)
-    share, spread = _brightest(sum(halves), count)
+    share, spread, products = _brightest(halves[0] + halves[1], count)
 
     def slopes_of(share: np.ndarray) -> np.ndarray:
         pictures = product((share / spread[:, None]).T, values.T)
@@ -141,13 +139,12 @@ def unmix(
     if min(rank, units // 6) > 1:
         moves = _moves(slopes, grid[:3])
         moved = product(values, moves) / spread[:, None]
-        products = sum(halves) / np.outer(spread, spread)
         others, weight = _colours(rest, products, moved, product(moves, moves), count, rank)
         if len(weight):
             share, rest = np.hstack([share, others]), rest - others * weight @ others.T
             slopes = np.concatenate([slopes, slopes_of(others)])
     return Aligned(
-        values, spread, halves, share, rest, slopes, grid, lattice.baseline, edges.shared
+        values, spread, halves, products, share, rest, slopes, grid, lattice.baseline, edges.shared
     )
 
 
@@ -255,7 +252,7 @@ def _products(values: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def _brightest(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _brightest(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return how units show the one picture that explains most, and their noise.
 
     Parameters
@@ -269,11 +266,13 @@ def _brightest(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
     -------
     share : array, (M, 1), of length one: values / spread is about share @ picture.
     spread : array, (M,), standard deviation of each unit's noise.
+    products : array, (M, M), in units of the noise.
     """
     strength, share = strongest(products)
     alone = np.diag(products) - strength * share[:, 0] ** 2  # what is left of each unit
     spread = np.sqrt(np.maximum(alone / count, 1e-5))
-    return strongest(products / np.outer(spread, spread))[1], spread
+    products = products / np.outer(spread, spread)
+    return strongest(products)[1], spread, products
 
 
 def _colours(

@@ -24,8 +24,8 @@ def single_shifts(aligned: Aligned) -> tuple[np.ndarray, np.ndarray]:
     rows, columns = ((slice(0, size // 2), slice(size // 2, size)) for size in shape)
     slopes = aligned.slopes[0].reshape(2, 2, *shape)
     rises = np.zeros((4, *slopes.shape), np.float32)
-    for rise, (row, column) in zip(rises, [(r, c) for r in rows for c in columns], strict=True):
-        rise[..., row, column] = slopes[..., row, column]
+    for number, quarter in enumerate((row, column) for row in rows for column in columns):
+        rises[(number, ..., *quarter)] = slopes[(..., *quarter)]
     rises = rises.reshape(4, 2, -1)
     moved = product(aligned.values, rises.reshape(8, -1)) / aligned.spread[:, None]
     pull = -first[:, None] * (rest @ moved) * scale
