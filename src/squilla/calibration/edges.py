@@ -14,21 +14,8 @@ import numpy as np
 _SMOOTHING = (2, 4, 8)
 """Standard deviations of the smoothing before the gradient to choose from, px."""
 
-_BELL_WIDTH = 2
-"""What is left of it for the gradient, in means over so many pixels that this is enough."""
-
-_REACH = 3 * _BELL_WIDTH
-
-
-def _half_taps() -> tuple[np.ndarray, np.ndarray]:
-    """Return the taps of a Gaussian and of its slope from the middle on, both of unit response."""
-    tap = np.arange(_REACH + 1)
-    bell = np.exp(-((tap / _BELL_WIDTH) ** 2) / 2)
-    slope = tap * bell / (2 * tap**2 @ bell)
-    return (bell / (2 * bell.sum() - 1)).astype(np.float32), slope.astype(np.float32)
-
-
-_BELL, _SLOPE = _half_taps()
+_FINE = 2
+"""Smoothing, in points, that shows all there is to see: coarser pictures are halved before."""
 
 _CLEAR = 100.0
 """Power of gradients over that of their noise from which on more smoothing only loses detail."""
@@ -104,7 +91,7 @@ def find_edges(
     step = max(min(step, smooth), smooth // 2)
     values, wrong = _gradients(images, bad, smooth, step)
     _scale(values, wrong)
-    return Edges(values, wrong, step, (smooth // _BELL_WIDTH - 1) / 2, smooth)
+    return Edges(values, wrong, step, (smooth // _FINE - 1) / 2, smooth)
 
 
 def _enough(images: np.ndarray, bad: np.ndarray, noise: np.ndarray, choice: list[int]) -> int:
@@ -115,8 +102,9 @@ def _enough(images: np.ndarray, bad: np.ndarray, noise: np.ndarray, choice: list
     for smooth in choice:
         values, wrong = _gradients(some, bad, smooth, 2 * smooth)
         power = np.einsum("cmhw,cmhw->m", values, values) / (np.sum(~wrong, (1, 2)) + 1e-9)
-        bell, slope = 2 * np.sum(_BELL[1:] ** 2) + _BELL[0] ** 2, 2 * np.sum(_SLOPE**2)
-        of_noise = 2 * noise * (_BELL_WIDTH / smooth) ** 2 * bell * slope
+        bell, slope = _half_taps(smooth)
+        gain = (2 * np.sum(bell**2) - bell[0] ** 2) * 2 * np.sum(slope**2)
+        of_noise = 2 * noise * gain * (smooth // _FINE) ** 2
         above.append(float(np.median(power / of_noise)))
         if above[-1] > _CLEAR:
             return smooth
@@ -127,70 +115,89 @@ def _gradients(
     images: np.ndarray, bad: np.ndarray, smooth: int, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the smoothed gradient along x and y, (2, M, h, w), and where it is wrong."""
-    flaws, size = bad.view(np.uint8), smooth // _BELL_WIDTH
-    for _ in range(size.bit_length() - 1):
+    flaws, size, variance = bad.view(np.uint8), 1, float(smooth**2)
+    while size * _FINE < smooth:
         images, flaws = _halved(images, flaws)
+        variance -= 0.75 * size**2  # which halving has smoothed by
+        size *= 2
     every = step // size
     shape = (len(images), *(-(-length // every) for length in images.shape[1:]))
     values, wrong = np.empty((2, *shape), np.float32), np.empty(shape, bool)
-    _gradient(images, flaws, every, values, wrong)
+    _gradient(images, flaws, every, *_half_taps(np.sqrt(variance) / size), values, wrong)
     return values, wrong
+
+
+def _half_taps(width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the taps of a Gaussian and of its slope from the middle on, both of unit response."""
+    tap = np.arange(int(np.ceil(3 * width)) + 1)
+    bell = np.exp(-((tap / width) ** 2) / 2)
+    slope = tap * bell / (2 * tap**2 @ bell)
+    return (bell / (2 * bell.sum() - 1)).astype(np.float32), slope.astype(np.float32)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
 def _halved(images, flaws):
-    """Return the means over two by two pixels, and how many of them are bad."""
+    """Return pictures of half the size, smoothed by (1 3 3 1) / 8, and how much of them is bad."""
     units, rows, columns = images.shape
     height, width = rows // 2, columns // 2
     means = np.empty((units, height, width), np.float32)
     counts = np.empty((units, height, width), np.uint8)
+    one, three = np.float32(1 / 8), np.float32(3 / 8)
     for line in numba.prange(units * height):
         unit, row = line // height, line % height
         upper, lower = images[unit, 2 * row], images[unit, 2 * row + 1]
+        above, below = images[unit, max(2 * row - 1, 0)], images[unit, min(2 * row + 2, rows - 1)]
         more, still = flaws[unit, 2 * row], flaws[unit, 2 * row + 1]
-        pair, flawed = np.empty(2 * width, np.float32), np.empty(2 * width, np.uint8)
+        down, flawed = np.empty(2 * width + 2, np.float32), np.empty(2 * width, np.uint8)
+        inner = down[1:]
         for column in range(2 * width):
-            pair[column] = np.float32(0.25) * (upper[column] + lower[column])
+            outer = one * (above[column] + below[column])
+            inner[column] = outer + three * (upper[column] + lower[column])
             flawed[column] = more[column] + still[column]
+        down[0], down[-1] = down[1], down[-2]
         mean, count = means[unit, row], counts[unit, row]
         for column in range(np.uint32(width)):  # never negative, or it were no vector loop
-            mean[column] = pair[2 * column] + pair[2 * column + 1]
+            outer = one * (down[2 * column] + down[2 * column + 3])
+            mean[column] = outer + three * (down[2 * column + 1] + down[2 * column + 2])
             count[column] = flawed[2 * column] + flawed[2 * column + 1]
     return means, counts
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
-def _gradient(images, flaws, step, values, wrong):
+def _gradient(images, flaws, step, bell, slope, values, wrong):
     """Fill in the gradient at every `step`-th point, and where more than a few flaws spoil it."""
     units, rows, columns = images.shape
     _, _, height, _width = values.shape
-    count = columns - 2 * _REACH
+    reach = len(bell) - 1
+    count = columns - 2 * reach
     for line in numba.prange(units * height):
         unit, row = line // height, line % height
         middle = row * step
         values[:, unit, row], wrong[unit, row] = 0, True
-        if middle < _REACH or middle >= rows - _REACH:
+        if middle < reach or middle >= rows - reach:
             continue
-        smooth, steep = _BELL[0] * images[unit, middle], np.zeros(columns, np.float32)
-        for k in range(1, _REACH + 1):
+        smooth, steep = bell[0] * images[unit, middle], np.zeros(columns, np.float32)
+        for k in range(1, reach + 1):
             above, below = images[unit, middle - k], images[unit, middle + k]
+            a, b = bell[k], slope[k]
             for column in range(columns):
-                smooth[column] += _BELL[k] * (above[column] + below[column])
-                steep[column] += _SLOPE[k] * (below[column] - above[column])
-        x, y = np.zeros(count, np.float32), _BELL[0] * steep[_REACH : _REACH + count]
-        for k in range(1, _REACH + 1):
-            left, right = smooth[_REACH - k :], smooth[_REACH + k :]
-            near, far = steep[_REACH - k :], steep[_REACH + k :]
+                smooth[column] += a * (above[column] + below[column])
+                steep[column] += b * (below[column] - above[column])
+        x, y = np.zeros(count, np.float32), bell[0] * steep[reach : reach + count]
+        for k in range(1, reach + 1):
+            left, right = smooth[reach - k :], smooth[reach + k :]
+            near, far = steep[reach - k :], steep[reach + k :]
+            a, b = bell[k], slope[k]
             for n in range(count):
-                x[n] += _SLOPE[k] * (right[n] - left[n])
-                y[n] += _BELL[k] * (near[n] + far[n])
-        first, last = -(-_REACH // step), (columns - _REACH - 1) // step + 1
+                x[n] += b * (right[n] - left[n])
+                y[n] += a * (near[n] + far[n])
+        first, last = -(-reach // step), (columns - reach - 1) // step + 1
         across, down = values[0, unit, row, first:last], values[1, unit, row, first:last]
-        flags, start = wrong[unit, row, first:last], first * step - _REACH
+        flags, start = wrong[unit, row, first:last], first * step - reach
         for n in range(last - first):
             across[n], down[n], flags[n] = x[start + n * step], y[start + n * step], False
         spoilt, some = np.zeros(columns, np.uint8), False
-        for near in range(middle - _REACH, middle + _REACH + 1):
+        for near in range(middle - reach, middle + reach + 1):
             flawed = flaws[unit, near]
             for column in range(columns):
                 spoilt[column] += flawed[column]
@@ -200,7 +207,7 @@ def _gradient(images, flaws, step, values, wrong):
             for n in range(last - first):
                 middle = start + n * step
                 # Single pixels were filled; more are an area with its own edges.
-                if spoilt[middle : middle + 2 * _REACH + 1].sum() > 4:
+                if spoilt[middle : middle + 2 * reach + 1].sum() > 4:
                     across[n], down[n], flags[n] = 0, 0, True
 
 
