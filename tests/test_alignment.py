@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from typer.testing import CliRunner
 
 from conftest import small_design
@@ -105,6 +106,28 @@ def shift_error(lattice: Lattice, found, plane) -> float:
     error = (plane_map(found.plane - plane, lattice))[..., None, None] * lattice.baseline
     error = error + found.offset
     return rms(error - error.mean(2, keepdims=True))
+
+
+@pytest.mark.parametrize(
+    ("step", "noise", "smooth"), [(2, None, 2), (4, None, 4), (2, 0.2, 4), (2, 1.0, 8)]
+)
+def test_edges_are_the_slopes_of_the_smoothed_picture(step, noise, smooth):
+    """However small the picture was made on the way, and wherever its points lie then."""
+    picture = ndimage.gaussian_filter(np.random.default_rng(4).standard_normal((260, 301)), 3)
+    picture /= picture.std()
+    edges = find_edges(
+        picture[None].astype(np.float32),
+        noise=None if noise is None else np.array([noise]),
+        step=step,
+    )
+    assert edges.smooth == smooth
+    place = np.mgrid[: edges.bad.shape[1], : edges.bad.shape[2]] * edges.step + edges.corner
+    slopes = [ndimage.gaussian_filter(picture, smooth, order) for order in ((0, 1), (1, 0))]
+    expected = np.stack([ndimage.map_coordinates(slope, place) for slope in slopes])
+    good = ~edges.bad[0]
+    assert good.mean() > 0.5
+    expected = expected[:, good] / np.sqrt(np.mean(np.sum(expected[:, good] ** 2, 0)))
+    assert rms(edges.values[:, 0, good] - expected) < 0.02
 
 
 @pytest.mark.parametrize("plane", [(3.0, 0.0, 0.0), (6.5, 0.25, -0.3), (0.4, -0.02, 0.03)])
