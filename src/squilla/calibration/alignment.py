@@ -341,6 +341,8 @@ def place(
     found = find_plane(edges, lattice, first, span, start=start)
     moved = drift(found, lattice)
     told = moved > max(STALE, 1.5 * looseness(found)) and found.score > _CLEAR
+    if told and refine is None and start is not None:  # for that, one looks again, more closely
+        return place(views, lattice, largest, noise=noise)
     if refine or (refine is None and told):
         free = max(moved, STALE)
         found = find_plane(edges, lattice, first, span, start=found.plane, free=free)
