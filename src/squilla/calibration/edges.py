@@ -15,7 +15,7 @@ _SMOOTHING = (2, 4, 8)
 """Standard deviations of the smoothing before the gradient to choose from, px."""
 
 _FINE = 2
-"""Smoothing, in points, that shows all there is to see: coarser pictures are halved before."""
+"""Standard deviation up to which pictures are smoothed as they are; for more, halved before, px."""
 
 _CLEAR = 100.0
 """Power of gradients over that of their noise from which on more smoothing only loses detail."""
@@ -197,17 +197,17 @@ def _gradient(images, flaws, step, bell, slope, values, wrong):
         for n in range(last - first):
             across[n], down[n], flags[n] = x[start + n * step], y[start + n * step], False
         spoilt, some = np.zeros(columns, np.uint8), False
-        for near in range(middle - reach, middle + reach + 1):
-            flawed = flaws[unit, near]
+        for k in range(middle - reach, middle + reach + 1):
+            flawed = flaws[unit, k]
             for column in range(columns):
                 spoilt[column] += flawed[column]
         for column in range(columns):  # most often nothing is wrong, which a vector loop tells
             some |= spoilt[column] > 0
         if some:
             for n in range(last - first):
-                middle = start + n * step
+                at = start + n * step
                 # Single pixels were filled; more are an area with its own edges.
-                if spoilt[middle : middle + 2 * reach + 1].sum() > 4:
+                if spoilt[at : at + 2 * reach + 1].sum() > 4:
                     across[n], down[n], flags[n] = 0, 0, True
 
 
