@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from typer.testing import CliRunner
 
 from conftest import small_design
@@ -107,6 +108,28 @@ def shift_error(lattice: Lattice, found, plane) -> float:
     return rms(error - error.mean(2, keepdims=True))
 
 
+@pytest.mark.parametrize(
+    ("step", "noise", "smooth"), [(2, None, 2), (4, None, 4), (2, 0.2, 4), (2, 1.0, 8)]
+)
+def test_edges_are_the_slopes_of_the_smoothed_picture(step, noise, smooth):
+    """However small the picture was made on the way, and wherever its points lie then."""
+    picture = ndimage.gaussian_filter(np.random.default_rng(4).standard_normal((260, 301)), 3)
+    picture /= picture.std()
+    edges = find_edges(
+        picture[None].astype(np.float32),
+        noise=None if noise is None else np.array([noise]),
+        step=step,
+    )
+    assert edges.smooth == smooth
+    place = np.mgrid[: edges.bad.shape[1], : edges.bad.shape[2]] * edges.step + edges.corner
+    slopes = [ndimage.gaussian_filter(picture, smooth, order) for order in ((0, 1), (1, 0))]
+    expected = np.stack([ndimage.map_coordinates(slope, place) for slope in slopes])
+    good = ~edges.bad[0]
+    assert good.mean() > 0.5
+    expected = expected[:, good] / np.sqrt(np.mean(np.sum(expected[:, good] ** 2, 0)))
+    assert rms(edges.values[:, 0, good] - expected) < 0.02
+
+
 @pytest.mark.parametrize("plane", [(3.0, 0.0, 0.0), (6.5, 0.25, -0.3), (0.4, -0.02, 0.03)])
 def test_a_tilted_plane_is_found(plane):
     lattice = array(spread=2.0)
@@ -134,6 +157,20 @@ def test_the_frame_before_spares_the_search():
     cold = found_in(views, lattice)
     warm = found_in(views, lattice, start=plane + np.array([0.4, -0.05, 0.02]))
     np.testing.assert_allclose(warm.plane, cold.plane, atol=0.004)
+
+
+@pytest.mark.parametrize("distance", [90.0, 290.0, 1000.0])
+def test_a_scene_that_jumped_is_found(camera, calibration, scene, distance):
+    """The frame before may help, but never decides: wherever it lay, the same is found."""
+    raw = camera.capture(
+        scene, distance=distance, snr=30, generator=torch.Generator().manual_seed(3)
+    )
+    cold = measure(raw, calibration)
+    for before in (0.0, 0.2, 0.6, 1.2, 2.1, 4.0):
+        start = replace(cold, disparity=torch.full_like(cold.disparity, before))
+        warm = measure(raw, calibration, start=start)
+        assert warm.provenance["alignment"] == "from the scene"
+        assert (warm.disparity - cold.disparity).abs().max() < 0.02
 
 
 def test_units_beside_their_places_are_found():

@@ -167,7 +167,8 @@ def measure(
         plane, offset, quality = place(
             even, lattice, largest, noise=noise, start=before, refine=refine
         )
-        if before is not None and np.abs(plane - before).sum() > _DRIFT:
+        placed = quality["alignment"] == "from the scene"
+        if before is not None and not (placed and np.abs(plane - before).sum() < _DRIFT):
             return measure(raw, calibration, nearest=nearest, refine=refine)  # another scene
         views = replace(views, offset=views.offset + offset)
         disparity = plane_map(plane, lattice).astype(np.float32)
@@ -340,6 +341,8 @@ def place(
     found = find_plane(edges, lattice, first, span, start=start)
     moved = drift(found, lattice)
     told = moved > max(STALE, 1.5 * looseness(found)) and found.score > _CLEAR
+    if told and refine is None and start is not None:  # for that, one looks again, more closely
+        return place(views, lattice, largest, noise=noise)
     if refine or (refine is None and told):
         free = max(moved, STALE)
         found = find_plane(edges, lattice, first, span, start=found.plane, free=free)

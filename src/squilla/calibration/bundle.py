@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from squilla.calibration.calibration import Lattice
-from squilla.calibration.disparity import compare, find_plane, plane_map
+from squilla.calibration.disparity import find_plane, plane_map
 from squilla.calibration.edges import find_edges
+from squilla.calibration.mixture import unmix
 from squilla.calibration.views import windows
 from squilla.errors import InputError
 
@@ -95,7 +96,8 @@ def _improve(scenes, lattice: Lattice, planes, distances):
     precision, pull = np.zeros((size, size)), np.zeros(size)
     for number, ((edges, corner), plane) in enumerate(zip(scenes, planes, strict=True)):
         disparity = plane_map(plane, lattice, edges.step)
-        found = compare(edges, lattice, lattice.centre - corner, disparity, 10, 1)
+        aligned = unmix(edges, lattice, lattice.centre - corner, disparity, 1)
+        own_pull, own_precision = aligned.of_units(10)
         # How a unit's displacement, 10 terms along each axis, answers to every unknown: its own
         # place and bend directly, its baseline as the place over the pitch, and the plane.
         answer = np.eye(units * 20, size).reshape(units, 2, 10, size)
@@ -107,8 +109,8 @@ def _improve(scenes, lattice: Lattice, planes, distances):
                 at = units * 20 + 3 * number + term
                 answer[:, axis, term, at] = lattice.baseline[:, axis]
         answer = answer.reshape(units * 20, size)
-        precision += answer.T @ found.precision.reshape(units * 20, -1) @ answer
-        pull += answer.T @ found.pull.ravel()
+        precision += answer.T @ own_precision.reshape(units * 20, -1) @ answer
+        pull += answer.T @ own_pull.ravel()
     doubt, known = np.full(size, 1e3), np.zeros(size)
     places = np.arange(units * 20).reshape(units, 2, 10)
     doubt[places[..., 0].ravel()] = _LOOSE

@@ -14,6 +14,9 @@ import numpy as np
 _SMOOTHING = (2, 4, 8)
 """Standard deviations of the smoothing before the gradient to choose from, px."""
 
+_FINE = 2
+"""Standard deviation up to which pictures are smoothed as they are; for more, halved before, px."""
+
 _CLEAR = 100.0
 """Power of gradients over that of their noise from which on more smoothing only loses detail."""
 
@@ -24,13 +27,15 @@ class Edges:
 
     values : (2, M, h, w) float32; of unit mean square for each unit, zero where bad.
     bad : (M, h, w) bool; where dead or saturated areas or the window's end make edges of their own.
-    step : distance of the points, px; the first lies on the window's first pixel.
+    step : distance of the points, px.
+    corner : where the first of them lies, down and across from the window's first pixel, px.
     smooth : standard deviation of the smoothing, px.
     """
 
     values: np.ndarray
     bad: np.ndarray
     step: int
+    corner: float
     smooth: float
 
     @property
@@ -50,7 +55,7 @@ class Edges:
         shape = (units, -(-height // 2), -(-width // 2))
         values, wrong = np.empty((2, *shape), np.float32), np.empty(shape, bool)
         _double_angle(self.values, self.bad, floor, values, wrong)
-        return Edges(values, wrong, 2 * self.step, self.smooth)
+        return Edges(values, wrong, 2 * self.step, self.corner, self.smooth)
 
 
 def find_edges(
@@ -86,17 +91,20 @@ def find_edges(
     step = max(min(step, smooth), smooth // 2)
     values, wrong = _gradients(images, bad, smooth, step)
     _scale(values, wrong)
-    return Edges(values, wrong, step, smooth)
+    return Edges(values, wrong, step, (smooth // _FINE - 1) / 2, smooth)
 
 
 def _enough(images: np.ndarray, bad: np.ndarray, noise: np.ndarray, choice: list[int]) -> int:
     """Return the least smoothing that lifts half of the pictures' gradients well above noise."""
-    some, above = slice(None, None, max(1, len(images) // 6)), []
+    few = slice(None, None, max(1, len(images) // 6))
+    some, bad, noise = images[few].copy(), bad[few].copy(), noise[few]
+    above = []
     for smooth in choice:
-        values, wrong = _gradients(images[some], bad[some], smooth, smooth)
+        values, wrong = _gradients(some, bad, smooth, 2 * smooth)
         power = np.einsum("cmhw,cmhw->m", values, values) / (np.sum(~wrong, (1, 2)) + 1e-9)
-        bell, slope = _derivative(smooth)
-        of_noise = 2 * noise[some] * (bell**2).sum() * (slope**2).sum()
+        bell, slope = _half_taps(smooth)
+        gain = (2 * np.sum(bell**2) - bell[0] ** 2) * 2 * np.sum(slope**2)
+        of_noise = 2 * noise * gain * (smooth // _FINE) ** 2
         above.append(float(np.median(power / of_noise)))
         if above[-1] > _CLEAR:
             return smooth
@@ -107,73 +115,100 @@ def _gradients(
     images: np.ndarray, bad: np.ndarray, smooth: int, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the smoothed gradient along x and y, (2, M, h, w), and where it is wrong."""
-    units, rows, columns = images.shape
-    shape = (units, -(-rows // step), -(-columns // step))
+    flaws, size, variance = bad.view(np.uint8), 1, float(smooth**2)
+    while size * _FINE < smooth:
+        images, flaws = _halved(images, flaws)
+        variance -= 0.75 * size**2  # which halving has smoothed by
+        size *= 2
+    every = step // size
+    shape = (len(images), *(-(-length // every) for length in images.shape[1:]))
     values, wrong = np.empty((2, *shape), np.float32), np.empty(shape, bool)
-    _gradient(images, bad, step, *_derivative(smooth), values, wrong)
+    _gradient(images, flaws, every, *_half_taps(np.sqrt(variance) / size), values, wrong)
     return values, wrong
 
 
-def _derivative(smooth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the taps of a Gaussian and of its slope, both of unit response."""
-    tap = np.arange(-int(np.ceil(3 * smooth)), int(np.ceil(3 * smooth)) + 1)
-    bell = np.exp(-(tap**2) / (2 * smooth**2))
-    bell /= bell.sum()
-    slope = tap * bell / (tap**2 * bell).sum()
-    return bell.astype(np.float32), slope.astype(np.float32)
+def _half_taps(width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the taps of a Gaussian and of its slope from the middle on, both of unit response."""
+    tap = np.arange(int(np.ceil(3 * width)) + 1)
+    bell = np.exp(-((tap / width) ** 2) / 2)
+    slope = tap * bell / (2 * tap**2 @ bell)
+    return (bell / (2 * bell.sum() - 1)).astype(np.float32), slope.astype(np.float32)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
-def _gradient(images, bad, step, bell, slope, values, wrong):
+def _halved(images, flaws):
+    """Return pictures of half the size, smoothed by (1 3 3 1) / 8, and how much of them is bad."""
+    units, rows, columns = images.shape
+    height, width = rows // 2, columns // 2
+    means = np.empty((units, height, width), np.float32)
+    counts = np.empty((units, height, width), np.uint8)
+    one, three = np.float32(1 / 8), np.float32(3 / 8)
+    for line in numba.prange(units * height):
+        unit, row = line // height, line % height
+        upper, lower = images[unit, 2 * row], images[unit, 2 * row + 1]
+        above, below = images[unit, max(2 * row - 1, 0)], images[unit, min(2 * row + 2, rows - 1)]
+        more, still = flaws[unit, 2 * row], flaws[unit, 2 * row + 1]
+        down, flawed = np.empty(2 * width + 2, np.float32), np.empty(2 * width, np.uint8)
+        inner = down[1:]
+        for column in range(2 * width):
+            outer = one * (above[column] + below[column])
+            inner[column] = outer + three * (upper[column] + lower[column])
+            flawed[column] = more[column] + still[column]
+        down[0], down[-1] = down[1], down[-2]
+        mean, count = means[unit, row], counts[unit, row]
+        for column in range(np.uint32(width)):  # never negative, or it were no vector loop
+            outer = one * (down[2 * column] + down[2 * column + 3])
+            mean[column] = outer + three * (down[2 * column + 1] + down[2 * column + 2])
+            count[column] = flawed[2 * column] + flawed[2 * column + 1]
+    return means, counts
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
+def _gradient(images, flaws, step, bell, slope, values, wrong):
+    """Fill in the gradient at every `step`-th point, and where more than a few flaws spoil it."""
     units, rows, columns = images.shape
     _, _, height, _width = values.shape
-    reach = len(bell) // 2
+    reach = len(bell) - 1
+    count = columns - 2 * reach
     for line in numba.prange(units * height):
         unit, row = line // height, line % height
         middle = row * step
         values[:, unit, row], wrong[unit, row] = 0, True
         if middle < reach or middle >= rows - reach:
             continue
-        smooth, steep = bell[reach] * images[unit, middle], np.zeros(columns, np.float32)
+        smooth, steep = bell[0] * images[unit, middle], np.zeros(columns, np.float32)
         for k in range(1, reach + 1):
             above, below = images[unit, middle - k], images[unit, middle + k]
-            a, b = bell[reach + k], slope[reach + k]
+            a, b = bell[k], slope[k]
             for column in range(columns):
                 smooth[column] += a * (above[column] + below[column])
                 steep[column] += b * (below[column] - above[column])
-        spoilt = np.zeros(columns, np.uint8)
-        for near in range(middle - reach, middle + reach + 1):
-            flags = bad[unit, near]
-            for column in range(columns):
-                spoilt[column] += flags[column]
-        # Every step-th sample together, so that the compiler makes vector loops of what follows.
-        length = columns // step
-        parts = np.empty((2, step, length), np.float32)
-        flags = np.empty((step, length), np.uint8)
-        for phase in range(step):
-            for n in range(length):
-                parts[0, phase, n] = smooth[n * step + phase]
-                parts[1, phase, n] = steep[n * step + phase]
-                flags[phase, n] = spoilt[n * step + phase]
-        first = -(-reach // step)
-        count = (step * length - reach - 1) // step + 1 - first
-        x, y = (
-            values[0, unit, row, first : first + count],
-            values[1, unit, row, first : first + count],
-        )
-        flawed = np.zeros(count, np.int32)
-        for k in range(len(bell)):
-            at, phase = (first * step + k - reach) // step, (first * step + k - reach) % step
-            a, b = parts[0, phase, at : at + count], parts[1, phase, at : at + count]
-            c, along, beside = flags[phase, at : at + count], slope[k], bell[k]
+        x, y = np.zeros(count, np.float32), bell[0] * steep[reach : reach + count]
+        for k in range(1, reach + 1):
+            left, right = smooth[reach - k :], smooth[reach + k :]
+            near, far = steep[reach - k :], steep[reach + k :]
+            a, b = bell[k], slope[k]
             for n in range(count):
-                x[n] += along * a[n]
-                y[n] += beside * b[n]
-                flawed[n] += c[n]
-        for n in range(count):
-            good = flawed[n] <= 4  # single pixels, filled; more are an area with its own edges
-            wrong[unit, row, first + n] = not good
-            x[n], y[n] = x[n] * good, y[n] * good
+                x[n] += b * (right[n] - left[n])
+                y[n] += a * (near[n] + far[n])
+        first, last = -(-reach // step), (columns - reach - 1) // step + 1
+        across, down = values[0, unit, row, first:last], values[1, unit, row, first:last]
+        flags, start = wrong[unit, row, first:last], first * step - reach
+        for n in range(last - first):
+            across[n], down[n], flags[n] = x[start + n * step], y[start + n * step], False
+        spoilt, some = np.zeros(columns, np.uint8), False
+        for k in range(middle - reach, middle + reach + 1):
+            flawed = flaws[unit, k]
+            for column in range(columns):
+                spoilt[column] += flawed[column]
+        for column in range(columns):  # most often nothing is wrong, which a vector loop tells
+            some |= spoilt[column] > 0
+        if some:
+            for n in range(last - first):
+                at = start + n * step
+                # Single pixels were filled; more are an area with its own edges.
+                if spoilt[at : at + 2 * reach + 1].sum() > 4:
+                    across[n], down[n], flags[n] = 0, 0, True
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=True)
@@ -184,9 +219,13 @@ def _scale(values, wrong):
         energy, count = 0.0, 1e-9
         for row in range(rows):
             across, down, flags = values[0, unit, row], values[1, unit, row], wrong[unit, row]
+            power, flawed = np.float32(0), np.uint32(0)
             for column in range(columns):
-                energy += across[column] ** 2 + down[column] ** 2
-                count += not flags[column]
+                power += across[column] * across[column] + down[column] * down[column]
+            for column in range(columns):
+                flawed += flags[column]
+            energy += power
+            count += columns - flawed
         values[:, unit] *= np.float32(1 / np.sqrt(energy / count + 1e-30))
 
 

@@ -43,8 +43,8 @@ def sub_images(raw: Raw, lattice: Lattice, pixels: Pixels, margin: int) -> SubIm
     """
     origin = _corners(lattice, margin)
     height, width = (size + 2 * margin for size in lattice.field)
-    image = np.zeros((len(origin), height, width), np.float32)
-    bad = np.ones(image.shape, bool)
+    image = np.empty((len(origin), height, width), np.float32)
+    bad = np.empty(image.shape, bool)
     exposure, saturation = np.float32(raw.exposure or 0.0), np.float32(pixels.saturation)
     saturated = np.zeros((len(origin), height), np.int64)
     _correct(
@@ -57,7 +57,7 @@ def sub_images(raw: Raw, lattice: Lattice, pixels: Pixels, margin: int) -> SubIm
     return SubImages(torch.from_numpy(image), torch.from_numpy(bad), offset, margin, share)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _correct(
     frame, bias, rate, exposure, flat, valid, saturation, origin, image, bad, saturated
 ):  # fmt: skip
@@ -67,21 +67,21 @@ def _correct(
         unit, row = line // height, line % height
         y, left = origin[unit, 0] + row, origin[unit, 1]
         start, stop = max(left, 0), min(left + width, columns)
+        image[unit, row], bad[unit, row] = 0, True
         if y < 0 or y >= rows or stop <= start:
             continue
         values, flags = image[unit, row, start - left : stop - left], bad[unit, row, start - left :]
         level, usable = frame[y, start:stop], valid[y, start:stop]
         dark, slope, share = bias[y, start:stop], rate[y, start:stop], flat[y, start:stop]
-        count = 0
         for n in range(stop - start):
-            light = np.float32(level[n])
-            over = light >= saturation
-            wrong = over or not usable[n]
-            count += over
-            flags[n] = wrong
-            value = (light - dark[n] - exposure * slope[n]) / share[n]
+            value = (np.float32(level[n]) - dark[n] - exposure * slope[n]) / share[n]
             # What is saturated was at least so bright.
             values[n] = value if usable[n] else np.float32(0)
+        count = 0
+        for n in range(stop - start):
+            over = np.float32(level[n]) >= saturation
+            flags[n] = over or not usable[n]
+            count += over
         saturated[unit, row] = count
 
 
