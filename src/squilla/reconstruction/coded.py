@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from squilla.reconstruction.compiled import inherited, mix
-from squilla.reconstruction.evidence import CORRECTED, SPECTRAL, Evidence
+from squilla.reconstruction.evidence import CORRECTED, SPECTRAL, UNHEARD, Evidence
 from squilla.reconstruction.kernels import compiled, over_rows, sigmoid, times
 from squilla.threads import single_threaded_products
 
-_CHANGED = CORRECTED[0]
+_CHANGED, _UNHEARD = CORRECTED[0], np.float32(UNHEARD)
 
 
 @compiled
@@ -26,11 +26,14 @@ def _changes(first, last, kin, coarse, own, alone, changes):
     for row in range(first, last):
         up, down = max((row - 1) // 2, 0), min((row + 1) // 2, below)
         for column in range(own.shape[1]):
+            itself, change = sigmoid(alone[row, column]), changes[row, column]
+            if itself < _UNHEARD:
+                change[:] = 0
+                continue
             before, after = max((column - 1) // 2, 0), min((column + 1) // 2, right)
             mix(kin[row, column], coarse, up, down, before, after, low, low.size)
-            itself = sigmoid(alone[row, column])
             for i in range(low.size):
-                changes[row, column, i] = itself * (own[row, column, i] - low[i])
+                change[i] = itself * (own[row, column, i] - low[i])
 
 
 @compiled
@@ -46,6 +49,11 @@ def _decoded(first, last, kin, spectra, changes, basis, bright, cube):
             share, change = kin[row, column], changes[row, column]
             p, q, r, s = share[0], share[1], share[2], share[3]
             spectrum, factor = cube[row, column], bright[row, column]
+            if not change.any():
+                for k in range(spectrum.size):
+                    value = p * a[k] + q * b[k] + r * c[k] + s * d[k]
+                    spectrum[k] = factor * max(value, np.float32(0))
+                continue
             for k in range(spectrum.size):
                 value = p * a[k] + q * b[k] + r * c[k] + s * d[k]
                 for i in range(_CHANGED):  # a constant: unrolled, and kept in registers

@@ -16,6 +16,7 @@ from torch import Tensor
 from squilla.reconstruction.evidence import (
     ALIKE,
     CORRECTED,
+    FEW,
     LEVELS,
     MISFITS,
     SAMPLE,
@@ -76,13 +77,13 @@ def _light(first, last, y, known):
 
 @compiled
 def _quiet_steps(first, last, y, ratio, flat, quiet, expected, steps):
-    """Write by how much neighbours differ, of what is expected; every other row."""
+    """Write by how much neighbours differ, of what is expected; in every row of `FEW`."""
     width, channels = y.shape[1:]
     seen = np.empty((2, quiet.shape[1]), np.float32)
     for row in range(first, last):
         before = np.float32(np.inf)
         for column in range(width):
-            pixel = y[2 * row, column]
+            pixel = y[FEW * row, column]
             now, then = seen[column % 2], seen[1 - column % 2]
             power = np.float32(0)
             for i in range(channels):
@@ -92,7 +93,7 @@ def _quiet_steps(first, last, y, ratio, flat, quiet, expected, steps):
             add_product(pixel, quiet, now)
             for i in range(now.size):
                 now[i] /= amplitude
-            power = ratio[2 * row, column] * (power / channels / amplitude / amplitude)
+            power = ratio[FEW * row, column] * (power / channels / amplitude / amplitude)
             if column > 0:
                 total = np.float32(0)
                 for i in range(now.size):
@@ -271,7 +272,7 @@ def light(y: np.ndarray, threads: int) -> np.ndarray:
 
 def noise_factor(y: np.ndarray, ratio: np.ndarray, camera: CompiledCamera, threads: int) -> float:
     """Return by how much a picture is noisier than it says, as `evidence.noise_factor` does."""
-    rows = (len(y) + 1) // 2
+    rows = -(-len(y) // FEW)
     expected, steps = np.empty((2, rows, y.shape[1] - 1), np.float32)
     over_rows(_quiet_steps, rows, threads, y, ratio, camera.flat, camera.quiet, expected, steps)
     steps = steps[(expected < 1e6) & ~np.isnan(steps)]

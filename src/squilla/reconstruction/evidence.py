@@ -36,8 +36,14 @@ CORRECTED = (16, 32)
 ALIKE = 1e-6
 """Variance by which shapes may differ and still be of one spectrum."""
 
+UNHEARD = 1e-3
+"""What a cell says by itself is not heard if it counts for less."""
+
 MISFITS = 10.0 ** np.arange(-6, -1.9, 0.5)
 """What calibrations may be wrong by, as a share of the signal's power: 60 dB to 20."""
+
+FEW = 4
+"""Every so many rows tell how noisy a picture is."""
 
 SAMPLE = 8
 """Every so many rows and columns of the spectral cells tell which it is."""
@@ -403,7 +409,7 @@ def noise_factor(y: Tensor, ratio: Tensor, camera: Camera) -> Tensor:
     the more in directions of the measurement that spectra hardly reach. The median of these
     differences over the picture is not moved by the edges in it.
     """
-    y, ratio = y[:, ::2], ratio[:, ::2]  # every other row is plenty
+    y, ratio = y[:, ::FEW], ratio[:, ::FEW]
     amplitude = (y @ camera.project[:, -1:]).clamp_min(1e-30)
     quiet = (y @ camera.quiet) / amplitude
     power = ratio * (y / amplitude).square().mean(-1)

@@ -14,6 +14,7 @@ from squilla.reconstruction.evidence import (
     LEVELS,
     SPECTRAL,
     TOLD,
+    UNHEARD,
     Camera,
     Evidence,
     View,
@@ -39,7 +40,8 @@ def descend(seen: Evidence) -> Tensor:
         x = inherit(seen.kin[level], x)
         own = seen.own[level]
         itself = torch.sigmoid(seen.alone[level])[..., None]
-        x[..., : own.shape[-1]].lerp_(own, itself)
+        heard = torch.where(itself < UNHEARD, 0, itself)
+        x[..., : own.shape[-1]].lerp_(own, heard)
     return x
 
 
