@@ -54,7 +54,7 @@ def times(first: int, last: int, picture: np.ndarray, matrix: np.ndarray, produc
 def over_rows(kernel: Callable[..., None], rows: int, threads: int, *arguments) -> None:
     """Call a kernel for all rows, shared by threads."""
     # Twice as many parts as threads, since the machine may have other work; but no small ones.
-    parts = min(rows // 32, 2 * threads)
+    parts = min(rows // 8, 4 * threads)
     if threads == 1 or parts < 2:
         kernel(0, rows, *arguments)
         return
