@@ -8,7 +8,7 @@ random array that any method was trained on. The networks that know one camera s
 camera's rows: `mlp` was trained on the broad prior; --networks adds every model file of a folder,
 such as those of the thesis' recipe that experiments/table_5_1.py leaves in experiments/work.
 Methods that treat every pixel alone are judged on 3000 pixels of each scene, the others on all.
-Writes experiments/results/accuracy.json.
+The whole table, with --networks, goes into experiments/results/accuracy.json and docs/compound.md.
 """
 
 import argparse
@@ -381,7 +381,7 @@ def main() -> None:
     proofs = peaks(options.weights) | sharpness(options.weights)
     for name, value in proofs.items():
         print(f"{name}: {value:.3f}")
-    if not options.only:
+    if options.networks and not (options.only or options.quick or options.weights):
         story = {"peaks and edges": proofs, "machine": platform.machine(), "rows": rows}
         RESULTS.write_text(json.dumps(story, indent=1) + "\n")
         render()

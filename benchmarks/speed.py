@@ -194,10 +194,9 @@ def main() -> None:
         )
     told = {"threads": threads, "load": load, "machine": platform.machine()}
     told |= {"multiply_adds_per_second": speed, "seconds": table}
-    if options.only:  # takes the place of the rows of that name
-        told = json.loads(RESULTS.read_text())
-        names = {row["row"] for row in table}
-        told["seconds"] = [row for row in told["seconds"] if row["row"] not in names] + table
+    names = {row["row"] for row in table}
+    before = json.loads(RESULTS.read_text())["seconds"] if RESULTS.exists() else []
+    told["seconds"] = [row for row in before if row["row"] not in names] + table
     RESULTS.write_text(json.dumps(told, indent=1) + "\n")
 
 

@@ -1,6 +1,6 @@
 """Learn what the `compound` model that ships knows: a prior of spectra.
 
-    python experiments/learn_compound.py                 # two cores, a minute
+    python experiments/learn_compound.py                 # two cores, two minutes
     python experiments/learn_compound.py --device cuda --count 1000000
 
 The basis and the clusters are those of seeded random spectra: measured reflectances under measured
@@ -57,7 +57,8 @@ def main() -> None:
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "not held of spectra kept aside, rms": float(beyond.norm() / spectra.norm()),
     }
-    RESULTS.write_text(json.dumps(story, indent=1) + "\n")
+    if options.output == WEIGHTS:
+        RESULTS.write_text(json.dumps(story, indent=1) + "\n")
     print(f"{options.output}: {story}")
 
 

@@ -363,23 +363,26 @@ def evidence_of(model, y, snr):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("wrong", [0.0, 0.01, 0.03])
-def test_a_calibration_that_is_wrong_is_noticed(model, wrong):
+@pytest.mark.parametrize(
+    ("filters", "wrong"), [(20, 0.0), (20, 0.01), (20, 0.03), (9, 0.0), (9, 0.03), (40, 0.03)]
+)
+def test_a_calibration_that_is_wrong_is_noticed(filters, wrong):
     """To a factor of five in power; without it the posterior would be wrong, and far too sure."""
-    generator = torch.Generator().manual_seed(4)
-    spectra = natural_spectra(36, CAMERA.wavelength, generator=generator)
+    camera = smooth_camera(0, filters=filters, bands=126)
+    model, generator = load_model("compound", camera), torch.Generator().manual_seed(4)
+    spectra = natural_spectra(36, camera.wavelength, generator=generator)
     place = torch.arange(96) // 16
     truth = spectra[6 * place[:, None] + place]
-    gain = 1 + wrong * torch.randn(20, generator=generator)
-    y = add_noise(CAMERA.project(truth) * gain, 35.0, generator)
-    seen, camera = evidence_of(model, y, 35.0)
-    found = float(measured_misfit(seen.spectral, camera, None))
+    gain = 1 + wrong * torch.randn(filters, generator=generator)
+    y = add_noise(camera.project(truth) * gain, 35.0, generator)
+    seen, front = evidence_of(model, y, 35.0)
+    found = float(measured_misfit(seen.spectral, front, None))
     if wrong:
         assert wrong**2 / 5 < found < wrong**2 * 3
     else:
         assert found == pytest.approx(MISFITS[0])
     x, width = model.with_interval(y, snr=35.0)
-    assert (x - truth).square().mean() < 0.03 * truth.square().mean()
+    assert (x - truth).square().mean() < 0.05 * truth.square().mean()
     assert ((x - truth).abs() <= width).float().mean() > 0.8
 
 
@@ -398,7 +401,9 @@ def test_kin_that_differ_less_than_the_noise_are_noticed(model):
     found = unlikeness(seen, camera)[0]
     most = int(planted.argmax())
     assert float(found[most]) == pytest.approx(float(planted[most]), rel=0.35)
-    calm, _ = evidence_of(model, add_noise(CAMERA.project(first).expand(128, 128, -1), 30.0), 30.0)
+    calm, _ = evidence_of(
+        model, add_noise(CAMERA.project(first).expand(128, 128, -1), 30.0, generator), 30.0
+    )
     assert unlikeness(calm, camera).sum() < planted.sum() / 20
 
 
@@ -443,6 +448,31 @@ def test_the_same_seed_learns_the_same_prior(learnt):
     again = learn_prior(camera.wavelength, count=3000, seed=1)
     for key, value in again.tensors().items():
         torch.testing.assert_close(model.state_dict()[f"prior_{key}"], value, rtol=0, atol=0)
+
+
+@torch.no_grad()
+def test_a_prior_is_learnt_on_the_cameras_own_band(tmp_path):
+    """And read there again: what was learnt at 400-1000 nm is not stretched a second time."""
+    wavelength = np.linspace(400, 1000, 61)
+    response = 0.5 + 0.4 * np.sin(np.linspace(1, 9, 16)[:, None] * wavelength / 60)
+    camera = Calibration.from_sensitivity(response, wavelength)
+    truth = natural_spectra(1, wavelength, generator=torch.Generator().manual_seed(3))
+    y = add_noise(camera.project(truth.expand(32, 32, -1)), 30.0, torch.Generator().manual_seed(1))
+    train("compound", camera, count=3000).save(tmp_path / "own.safetensors")
+    x = load_model(tmp_path / "own.safetensors", camera)(y, snr=30.0)
+    assert (x - truth).square().mean() < 0.005 * truth.square().mean()
+
+
+def test_too_few_spectra_teach_nothing():
+    with pytest.raises(InputError, match="too few to learn from; give 1000 or more"):
+        train("compound", CAMERA, count=50)
+
+
+@torch.no_grad()
+def test_the_dark_is_dark_and_certain(model):
+    x, width = model.with_interval(torch.zeros(32, 32, 20), snr=20.0)
+    assert (x == 0).all()
+    assert (width == 0).all()
 
 
 def test_few_bands_are_refused_before_anything_is_learnt():

@@ -148,7 +148,8 @@ def measure(
         raise InputError("Give either the distance of the scene or depth, which finds it.")
     largest = lattice.disparity(nearest if distance is None else distance)
     before = None
-    if start is not None and not depth and start.disparity.shape == lattice.field:
+    known = distance is not None or depth
+    if start is not None and not known and start.disparity.shape == lattice.field:
         before = fit_plane(start.disparity.numpy())
         largest = min(largest, float(np.abs(before).sum()) + _DRIFT)
     margin = int(np.ceil(largest * np.abs(lattice.baseline).max())) + _TAPS

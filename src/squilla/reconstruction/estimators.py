@@ -11,6 +11,9 @@ LEADING = 16
 _WITHIN, BEYOND = 5.0, 3.0
 """How far from its middle a piece of the sheet reaches, in its own variance, and in the noise's."""
 
+_PIECE = 4096
+"""Cells that are inferred at once."""
+
 QUIETEST = 6
 """Tables are interpolated between noise variances of 10^-QUIETEST to 10, two to a decade."""
 
@@ -34,6 +37,7 @@ class Estimators:
     """
 
     def __init__(self, response: Tensor, flat: Tensor, channels: int, prior: Prior):
+        self.directions = min(channels, len(response))  # others were appended, and see nothing
         seen, amplitude = response @ prior.basis, flat @ prior.basis
         nodes = torch.arange(2 * QUIETEST + 3)
         noise = 10 ** (nodes.double() / 2 - QUIETEST)
@@ -57,7 +61,8 @@ class Estimators:
         self.scores = vectors.transpose(0, 1).float()  # (D, G, D)
         self.offset = torch.einsum("gd,gde->ge", mean @ seen.T, vectors).float()  # (G, D)
         total = power + noise[:, None, None]  # (J, G, D)
-        self.log_share = (prior.share.log() - total.log().sum(-1) / 2).float()  # (J, G)
+        seeing = total[..., -self.directions :].log().sum(-1)
+        self.log_share = (prior.share.log() - seeing / 2).float()  # (J, G)
         self.learnt = prior.learnt
         piece = slice(prior.learnt, None)
         middle = mean[piece] @ seen.T
@@ -93,6 +98,11 @@ class Estimators:
         -------
         mean (N, C), variance of the spectrum (N, KNOTS), log evidence (N,) per direction
         """
+        if len(shape) > _PIECE:
+            pieces = zip(shape.split(_PIECE), noise.split(_PIECE), strict=True)
+            parts = [self.mixture(*piece) for piece in pieces]
+            mean, variance, evidence = (torch.cat(part) for part in zip(*parts, strict=True))
+            return mean, variance, evidence
         near = self.near(shape, noise)
         if shape.device.type != "cpu":  # without asking how many, so that it can be recorded
             return self._posterior(shape, noise, near)
@@ -108,7 +118,7 @@ class Estimators:
     def near(self, shape: Tensor, noise: Tensor) -> Tensor:
         """Return which pieces of the sheet each shape comes near, (N, L)."""
         beside = shape.square().sum(1, keepdim=True) - (shape @ self.middle).square()
-        return beside <= self.reach + BEYOND * shape.shape[1] * noise[:, None]
+        return beside <= self.reach + BEYOND * self.directions * noise[:, None]
 
     def _posterior(
         self, shape: Tensor, noise: Tensor, near: Tensor | None
@@ -134,7 +144,7 @@ class Estimators:
         among = (weight[..., None] * apart).mT @ apart  # (N, LEADING, LEADING)
         knots = self.knots[:LEADING]
         variance = variance + ((among @ knots) * knots).sum(1)
-        return mean, variance, torch.logsumexp(logs, 1) / size
+        return mean, variance, torch.logsumexp(logs, 1) / self.directions
 
     def wiener(self, shape: Tensor, noise: Tensor, size: int) -> Tensor:
         """Return the best linear estimate of the first coefficients, (N, D), (N,) -> (N, size)."""

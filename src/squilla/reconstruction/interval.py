@@ -130,7 +130,8 @@ def _excess(measured: View, told: Tensor) -> tuple[Tensor, Tensor]:
     factor = off.nanmedian(1).values / 0.4549  # the median of a square of a normal deviate
     usual = expected.masked_fill(~some, torch.nan).nanmedian(1).values
     count = some.sum(1).clamp_min(1)
-    return (factor - 1) * usual[:, None], 1.25 * usual * (2 / count).sqrt()
+    excess, error = (factor - 1) * usual[:, None], 1.25 * usual * (2 / count).sqrt()
+    return excess.nan_to_num(0), error.nan_to_num(0)  # in the dark nothing shows
 
 
 def _believed(value: Tensor, error: Tensor, sure: float) -> Tensor:

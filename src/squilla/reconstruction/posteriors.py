@@ -1,4 +1,4 @@
-"""Posteriors of the compound model on a processor: what `prior.Estimators` says, cell by cell.
+"""Posteriors of the compound model on a processor: what `estimators.Estimators` says, cell by cell.
 
 A view is one array, (H, W, 2 + D): noise variance, amplitude, and the shape in D directions.
 """
@@ -36,6 +36,7 @@ class CompiledCamera:
         learnt, scores = zones[0].learnt, stacked("scores")  # (Z, D, G, D)
         known = scores[:, :, :learnt].reshape(*scores.shape[:2], -1)
         self.mixture = (
+            zones[0].directions,
             np.concatenate([known, stacked("middle")], -1),
             np.ascontiguousarray(scores[:, :, learnt:].swapaxes(1, 2)),
             stacked("reach"),
@@ -86,28 +87,29 @@ def wiener(first, last, view, zone, misfit, vectors, power, gain, own):
 
 @compiled
 def mixture(
-    first, last, view, zone, misfit, scores, pieces, reach, offset, power, gain, mean, log_share,
-    within, knots, found, variance, evidence,
+    first, last, view, zone, misfit, seeing, scores, pieces, reach, offset, power, gain, mean,
+    log_share, within, knots, found, variance, evidence,
 ):  # fmt: skip
     """Write the posterior of `Estimators.mixture`; clusters without a say are left out.
 
+    seeing : directions in which the camera sees anything.
     scores : matrices that tell of each cell how it scores with what was learnt, and how far it goes
         along the middle of each piece.
     variance : left out if it has no knots.
     """
-    told = np.empty((1, view.shape[1], scores.shape[2]), np.float32)  # a row stays in the cache
+    row_scores = np.empty((1, view.shape[1], scores.shape[2]), np.float32)  # stay in the cache
     for row in range(first, last):
         one = slice(row, row + 1)
-        by_zone(0, 1, view[one], zone[one], scores, told)
+        by_zone(0, 1, view[one], zone[one], scores, row_scores)
         _mixed(
-            told[0], view[row], zone[row], misfit, pieces, reach, offset, power, gain, mean,
-            log_share, within, knots, found[row], variance[row], evidence[row],
+            row_scores[0], view[row], zone[row], misfit, seeing, pieces, reach, offset, power, gain,
+            mean, log_share, within, knots, found[row], variance[row], evidence[row],
         )  # fmt: skip
 
 
 @compiled
 def _mixed(
-    scores, view, zone, misfit, pieces, reach, offset, power, gain, mean, log_share,
+    scores, view, zone, misfit, seeing, pieces, reach, offset, power, gain, mean, log_share,
     within, knots, found, variance, evidence,
 ):  # fmt: skip
     """Do the work of `mixture` for one row."""
@@ -127,7 +129,7 @@ def _mixed(
             own, shift = score[k], offset[where, k]
             for i in range(directions):
                 own[i] = seen[k * directions + i] - shift[i]
-        beside, closest = -_BEYOND * np.float32(directions) * noise, np.float32(-np.inf)
+        beside, closest = -_BEYOND * np.float32(seeing) * noise, np.float32(-np.inf)
         for i in range(directions):
             beside += cell[i] * cell[i]
         along, wide = seen[learnt * directions :], reach[where]
@@ -155,8 +157,8 @@ def _mixed(
         for k in likely[:count]:
             weight[k] = math.exp(weight[k] - most)
             total += weight[k]
-        told = np.float32((most + math.log(total)) / directions)
-        evidence[column] = min(max(told, np.float32(-20)), np.float32(20))
+        each_direction = np.float32((most + math.log(total)) / seeing)
+        evidence[column] = min(max(each_direction, np.float32(-20)), np.float32(20))
         mixed = found[column]
         mixed[:] = 0
         for k in likely[:count]:

@@ -40,7 +40,8 @@ class Prior:
     """A mixture of Gaussians over the shapes of spectra.
 
     wavelength : (K,) nm.
-    basis : (K, C) orthonormal; a shape is ``basis @ coefficients``.
+    basis : (K, C) orthonormal on the grid that it was learnt on; a shape is
+        ``basis @ coefficients``.
     moment : (C, C) second moment of spectra with a peak of one, scaled to a mean power of one: what
         the best linear estimator needs.
     share : (G,) of each cluster, sums to 1.
@@ -75,10 +76,13 @@ class Prior:
     def on(self, wavelength: np.ndarray) -> "Prior":
         """Return the prior on another grid.
 
-        Within 500-750 nm it is read there; a band that reaches beyond is mapped onto 500-750 nm,
-        see `within_tables`.
+        A band that lies within the prior's is read there; one that reaches beyond is mapped onto
+        the measured tables', see `within_tables`.
         """
-        at = np.clip(within_tables(wavelength), self.wavelength[0], self.wavelength[-1])
+        wavelength = np.asarray(wavelength, float)
+        least, most = self.wavelength[[0, -1]]
+        inside = least - 1e-6 <= wavelength[0] and wavelength[-1] <= most + 1e-6
+        at = np.clip(wavelength if inside else within_tables(wavelength), least, most)
         basis = resample(self.basis.numpy().T, self.wavelength, at).T
         here = np.linspace(0, len(at) - 1, KNOTS)
         there = np.linspace(self.wavelength[0], self.wavelength[-1], KNOTS)
@@ -257,7 +261,7 @@ def fit_mixture(points: Tensor, clusters: int, *, rounds: int = 40) -> tuple[Ten
         chosen = torch.multinomial(away.cpu(), 1, generator=generator)
         centre = torch.cat([centre, direction[chosen.to(points.device)]])
     belongs = torch.cdist(direction, centre).argmin(1)
-    responsible = torch.nn.functional.one_hot(belongs, clusters).double()
+    responsible = functional.one_hot(belongs, clusters).double()
     whole = torch.cov(points.T)
     ridge = 1e-6 * whole.diagonal().mean() * torch.eye(len(whole)).to(whole)
     share, mean, covariance = responsible.mean(0), points[:clusters], []

@@ -16,6 +16,9 @@ HELD_OUT = 8
 LEARNT = 60_000
 """Spectra from which the model that ships has learnt."""
 
+LEAST = 1000
+"""Spectra with which no cluster stays empty."""
+
 FEWEST = CORRECTED[-1]
 """Bands that the model cannot do with fewer of."""
 
@@ -94,13 +97,15 @@ def learn_prior(
     Raises
     ------
     InputError
-        If the bands are too few.
+        If the bands or the spectra are too few.
     """
     if len(wavelength) < FEWEST:
         raise InputError(
             f"`compound` needs {FEWEST} bands or more, not {len(wavelength)}; train one of the "
             "networks instead."
         )
+    if count < LEAST:
+        raise InputError(f"{count} spectra are too few to learn from; give {LEAST} or more.")
     palette = Palette(wavelength, seed=seed, count=round(0.25 * count))
     generator = Generator().manual_seed(seed)
     lamp = (torch.rand(round(0.6 * count), generator=generator) * len(palette.lamp)).long()
