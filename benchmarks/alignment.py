@@ -444,7 +444,7 @@ def report() -> None:
 
 
 def speed() -> None:
-    """Print the median time of each stage, cold and from the frame before."""
+    """Print and keep the median time of each stage, cold and from the frame before."""
     twin = camera(0)
     design, lattice = twin.design, lattice_of(twin.design)
     pixels = Pixels(
@@ -498,6 +498,8 @@ def speed() -> None:
         timed(f"{name}: resample", lambda v=views, f=flat: align(v, lattice, f))
     timed("measure, cold", lambda: measure(raw, calibration))
     timed("measure, from the frame before", lambda: measure(raw, calibration, start=before))
+    story = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    RESULTS.write_text(json.dumps(story | {"milliseconds": spent}, indent=1) + "\n")
 
 
 def main() -> None:
