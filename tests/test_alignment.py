@@ -173,6 +173,16 @@ def test_a_scene_that_jumped_is_found(camera, calibration, scene, distance):
         assert (warm.disparity - cold.disparity).abs().max() < 0.02
 
 
+def test_a_given_distance_counts_more_than_the_frame_before(camera, calibration, scene):
+    """The field must reach as far as the distance asks, wherever the frame before was."""
+    raw = camera.capture(scene, distance=90, snr=30, generator=torch.Generator().manual_seed(1))
+    start = measure(raw, calibration, distance=1000)
+    found = measure(raw, calibration, distance=90, start=start)
+    expected = measure(raw, calibration, distance=90)
+    assert torch.equal(found.valid, expected.valid)
+    torch.testing.assert_close(found.y, expected.y, equal_nan=True)
+
+
 def test_units_beside_their_places_are_found():
     lattice, plane = array(), np.array([3.0, 0.05, 0.1])
     views = capture(lattice, plane, colours=1)
