@@ -32,7 +32,9 @@ def train(
     ] = 0.0,
     dropped: Annotated[float, typer.Option(help="Probability that a channel is lost.")] = 0.0,
     spectra: Annotated[str, typer.Option(help="Prior: broad, gaussian, natural, line.")] = "broad",
-    count: Annotated[int, typer.Option(help="Spectra in an epoch.")] = 8000,
+    count: Annotated[
+        int, typer.Option(help="Spectra in an epoch; compound learns from 60000 unless told.")
+    ] = 8000,
     epochs: Annotated[int, typer.Option(help="Passes over as many spectra.")] = 500,
     batch: Annotated[int, typer.Option(help="Spectra in a step.")] = 1024,
     learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = 1e-4,
@@ -50,7 +52,7 @@ def train(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Train a network for a calibrated camera.
+    """Train a network for a calibrated camera; or learn the prior of compound on its wavelengths.
 
     Example: squilla train --calibration camera.nc --model respecnn -o model.safetensors
 

@@ -69,8 +69,8 @@ def train(
     ----------
     name : str
         A network of `models`: "mlp", "cnn", "rescnn", "unet", "respecnn"; or "compound", which
-        learns its prior anew on the camera's wavelengths (`training.prior`) from `count` spectra:
-        it takes `seed`, `device` and `progress` too, and refuses the others.
+        learns its prior anew on the camera's wavelengths (`training.prior`) from `count` spectra,
+        60 000 unless told: it takes `seed` and `device` too, and refuses what shapes a training.
     calibration : Calibration
         With several field angles, every sample gets one at random.
     noise : None, float, (float, float) or SensorNoise
