@@ -52,7 +52,9 @@ def train(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Train a network for a calibrated camera; or learn the prior of compound on its wavelengths.
+    """Train a network for a calibrated camera, or learn a prior.
+
+    With `--model compound` the prior is learnt on the wavelengths of the camera.
 
     Example: squilla train --calibration camera.nc --model respecnn -o model.safetensors
 
