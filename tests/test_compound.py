@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import cauchy, multivariate_normal, norm
 
 from random_camera import smooth_camera
 from squilla.calibration.alignment import Measurement
@@ -14,10 +14,15 @@ from squilla.reconstruction.estimators import Estimators
 from squilla.reconstruction.evidence import (
     LEVELS,
     MISFITS,
+    SHADED,
     TOLD,
+    UNALIKE,
+    Brightness,
     Camera,
     View,
+    _alike_in_brightness,
     _telling,
+    brightened,
     coarser,
     gather_evidence,
     inherit,
@@ -222,6 +227,47 @@ def test_each_side_of_an_edge_takes_from_its_own():
     assert (mixed[:, 4:] > 1 - 1e-3).all()
 
 
+def test_differences_of_brightness_are_a_likelihood_ratio():
+    bright, dark = torch.tensor(3.0), torch.tensor([0.1, 1.0, 2.9, 3.0])
+    apart = (2 * (bright - dark) / (bright + dark)).numpy()
+    expected = cauchy.pdf(apart, scale=SHADED) / cauchy.pdf(apart, scale=UNALIKE)
+    np.testing.assert_allclose(_alike_in_brightness(bright, dark), expected, rtol=1e-5)
+    np.testing.assert_allclose(_alike_in_brightness(dark, bright), expected, rtol=1e-5)
+
+
+def test_telling_counts_only_what_differs_at_one_amplitude():
+    """Spectra drawn with the prior's moments: what their amplitude does not explain of them."""
+    prior = broad_prior().on(CAMERA.wavelength)
+    camera = Camera(CAMERA.sensitivities, prior)
+    root = torch.linalg.cholesky(prior.moment + 1e-12 * torch.eye(len(prior.moment)))
+    random = torch.Generator().manual_seed(0)
+    drawn = torch.randn(40_000, len(root), generator=random, dtype=torch.float64) @ root.T
+    seen = drawn @ (CAMERA.sensitivities[0].double() @ prior.basis).T @ camera.project.double()
+    amplitude, seen = seen[:, -1:], seen[:, :TOLD]
+    left = seen - amplitude * (seen * amplitude).mean(0) / amplitude.square().mean()
+    expected = left.var(0) * CAMERA.filters / seen.square().sum(1).mean()
+    torch.testing.assert_close(camera.power, expected.float(), rtol=0.05, atol=1e-7)
+    assert camera.power[0] < 0.1  # most of it was the amplitude
+
+
+@pytest.mark.parametrize("texture", [0.0, 0.1])
+def test_brightness_keeps_texture_and_leaves_noise_out(texture):
+    camera = Camera(CAMERA.sensitivities, broad_prior().on(CAMERA.wavelength))
+    random = torch.Generator().manual_seed(0)
+    variance = 1e-4  # of the brightness
+    truth = 2 * (1 + texture * torch.randn(1, 64, 64, generator=random))
+    measured = truth * (1 + variance**0.5 * torch.randn(1, 64, 64, generator=random))
+    view = View(
+        torch.ones(1, 64, 64, 1), torch.full((1, 64, 64), variance * CAMERA.filters), measured
+    )
+    kin = torch.full((1, 64, 64, 4), 0.25)
+    known = Brightness(torch.full((1, 32, 32), 2.0), torch.full((1, 32, 32), variance / 100))
+    found = brightened(view, kin, known, camera)
+    off = (found.amplitude / truth - 1).square().mean()
+    assert off < (1.1 if texture else 0.06) * variance
+    assert off < 2 * found.variance.mean() < 8 * off
+
+
 @pytest.mark.parametrize("wrong", [-6.0, 0.0, 6.0])
 def test_noise_that_is_stated_wrong_is_measured(wrong):
     camera = Camera(CAMERA.sensitivities, broad_prior().on(CAMERA.wavelength))
@@ -250,6 +296,21 @@ def test_edges_stay_where_they_are(model):
     y = add_noise(CAMERA.project(truth), 30.0, torch.Generator().manual_seed(5))
     error = (model(y, snr=30.0) - truth).square().mean((0, 2))
     assert error[23:25].max() < 5 * error.mean() + 1e-4
+
+
+@torch.no_grad()
+def test_a_dark_bar_keeps_its_colour_beside_a_bright_one(model):
+    """Their shapes differ by less than the noise of a pixel, their brightness ten times."""
+    spectra = natural_spectra(2, CAMERA.wavelength, generator=torch.Generator().manual_seed(0))
+    spectra[1] = 0.1 * spectra.mean(0)
+    bar = ((torch.arange(96) >= 44) & (torch.arange(96) < 52)).long()
+    truth = spectra[bar].expand(96, -1, -1).contiguous()
+    projected = CAMERA.project(spectra) @ model._camera(None, False).project
+    shape = projected[:, :-1] / projected[:, -1:]
+    assert (shape[0] - shape[1]).square().sum() < 0.5 * 0.01 * TOLD
+    x = model(add_noise(CAMERA.project(truth), 20.0, torch.Generator().manual_seed(5)), snr=20.0)
+    inside = x[:, 45:51].mean((0, 1))
+    assert (inside - spectra[1]).norm() < (inside - 0.1 * spectra[0]).norm() / 2
 
 
 @torch.no_grad()

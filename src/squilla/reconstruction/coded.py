@@ -12,10 +12,12 @@ from torch import Tensor
 
 from squilla.reconstruction.compiled import inherited, mix
 from squilla.reconstruction.evidence import CORRECTED, SPECTRAL, UNHEARD, Evidence
-from squilla.reconstruction.kernels import compiled, over_rows, sigmoid, times
+from squilla.reconstruction.kernels import compiled, over_rows, sigmoid
 from squilla.threads import single_threaded_products
 
 _CHANGED, _UNHEARD = CORRECTED[0], np.float32(UNHEARD)
+_ROWS = 16
+"""Rows of a picture that are spelt out at a time."""
 
 
 @compiled
@@ -37,11 +39,14 @@ def _changes(first, last, kin, coarse, own, alone, changes):
 
 
 @compiled
-def _decoded(first, last, kin, spectra, changes, basis, bright, cube):
-    """Write non-negative spectra: those of the four coarse cells mixed, changed, and bright."""
+def _decoded(first, last, top, kin, spectra, changes, basis, bright, cube):
+    """Write non-negative spectra: those of the four coarse cells mixed, changed, and bright.
+
+    spectra : of as many coarse rows as it takes, from row `top` on.
+    """
     below, right = spectra.shape[0] - 1, spectra.shape[1] - 1
     for row in range(first, last):
-        up, down = max((row - 1) // 2, 0), min((row + 1) // 2, below)
+        up, down = max((row - 1) // 2 - top, 0), min((row + 1) // 2 - top, below)
         for column in range(cube.shape[1]):
             before, after = max((column - 1) // 2, 0), min((column + 1) // 2, right)
             a, b = spectra[up, before], spectra[up, after]
@@ -59,6 +64,16 @@ def _decoded(first, last, kin, spectra, changes, basis, bright, cube):
                 for i in range(_CHANGED):  # a constant: unrolled, and kept in registers
                     value += change[i] * basis[i, k]
                 spectrum[k] = factor * max(value, np.float32(0))
+
+
+def _spelt_out(first, last, coarse, basis, kin, changes, bright, cube):
+    """Write the spectra of some rows, a few at a time, whose coarse spectra the caches hold."""
+    room = np.empty((_ROWS // 2 + 2, coarse.shape[1], basis.shape[1]), np.float32)
+    for start in range(first, last, _ROWS):
+        stop = min(start + _ROWS, last)
+        top, bottom = max((start - 1) // 2, 0), min(stop // 2 + 1, len(coarse))
+        spectra = np.matmul(coarse[top:bottom], basis, out=room[: bottom - top])
+        _decoded(start, stop, top, kin, spectra, changes, basis[:_CHANGED], bright, cube)
 
 
 # --- all of it ----------------------------------------------------------------------------------
@@ -86,14 +101,12 @@ class Coded:
         bands = basis.shape[1]
         whole = np.zeros((len(basis), bands + -bands % 16), np.float32)  # full vector registers
         whole[:, :bands] = basis
-        spectra = np.empty((*self.coarse.shape[:2], whole.shape[1]), np.float32)
-        over_rows(times, len(spectra), threads, self.coarse, whole, spectra)
         # NumPy, other than torch, asks for huge pages: four times as fast where memory is new.
         cube = np.empty((*self.bright.shape, bands), np.float32)
+        bright = np.ascontiguousarray(self.bright)
         over_rows(
-            _decoded, len(cube), threads, self.kin, spectra, self.changes,
-            whole[:_CHANGED], np.ascontiguousarray(self.bright), cube,
-        )  # fmt: skip
+            _spelt_out, len(cube), threads, self.coarse, whole, self.kin, self.changes, bright, cube
+        )
         return cube
 
     def at(self, rows: ArrayLike, columns: ArrayLike, basis: np.ndarray) -> np.ndarray:
@@ -129,5 +142,5 @@ def blended(seen: Evidence, known: np.ndarray, threads: int) -> Coded:
             low[..., : own.shape[-1]] += changes
             x = low
     height, width = known.shape
-    bright = array(seen.pixels.amplitude)[:height, :width] * known
+    bright = array(seen.bright.amplitude)[:height, :width] * known
     return Coded(x, array(seen.kin[0]), changes, bright)

@@ -20,8 +20,12 @@ from squilla.reconstruction.evidence import (
     LEVELS,
     MISFITS,
     SAMPLE,
+    SHADED,
     SPECTRAL,
+    TEXTURE,
     TOLD,
+    UNALIKE,
+    Brightness,
     Evidence,
     View,
     likeliest,
@@ -31,6 +35,8 @@ from squilla.reconstruction.posteriors import CompiledCamera, mixture, wiener
 from squilla.threads import single_threaded_products
 
 _HALF, _ALIKE = np.float32(0.5), np.float32(ALIKE)
+_SHADED, _UNALIKE = np.float32(SHADED), np.float32(UNALIKE)
+_AROUND, _ITSELF = np.float32(1 / TEXTURE[0]), np.float32(1 / TEXTURE[1])
 _ROWS = 16
 """Rows of a picture that are worked on at a time where a step leaves something to the next."""
 
@@ -59,6 +65,18 @@ def _difference(one, other, scale):
         apart = one[2 + i] - other[2 + i]
         total += apart * apart * scale[i]
     return total
+
+
+@compiled
+def _alike_in_brightness(one, other):
+    apart = 2 * (one[1] - other[1]) / (one[1] + other[1])
+    apart *= apart
+    return _SHADED / _UNALIKE * (_UNALIKE * _UNALIKE + apart) / (_SHADED * _SHADED + apart)
+
+
+@compiled
+def _probability(log_odds, odds):
+    return odds / (odds + math.exp(-log_odds))
 
 
 # --- from the measurement to views of every level -----------------------------------------------
@@ -159,7 +177,9 @@ def _coarser(first, last, fine, power, view):
                 share[i, i] = ONE / parts[i][0]
                 for j in range(i):
                     against = _telling(parts[i][0] + parts[j][0] + 2 * _ALIKE, power, scale)
-                    alike = sigmoid(against - _difference(parts[i], parts[j], scale))
+                    apart = _difference(parts[i], parts[j], scale)
+                    lit = _alike_in_brightness(parts[i], parts[j])
+                    alike = _probability(against - apart, lit)
                     share[i, j], share[j, i] = alike / parts[j][0], alike / parts[i][0]
             most, certainty = 0, np.float32(0)
             for i in range(4):
@@ -189,7 +209,8 @@ def _among_neighbours(first, last, view, power, known):
                     if y == row and x == column:
                         continue
                     other = view[y, x]
-                    share = sigmoid(against - _difference(own, other, scale)) / other[0]
+                    lit = _alike_in_brightness(own, other)
+                    share = _probability(against - _difference(own, other, scale), lit) / other[0]
                     weight += share
                     for i in range(1, size):
                         cell[i] += share * other[i]
@@ -221,7 +242,10 @@ def _kinship(first, last, view, known, coarse, power, kin, alone):
                 most = max(most, shares[number])
             total = np.float32(0)
             for number in range(4):
-                shares[number] = math.exp(shares[number] - most) / (around[number][0] + _ALIKE)
+                lit = _alike_in_brightness(own, around[number])
+                shares[number] = (
+                    math.exp(shares[number] - most) * lit / (around[number][0] + _ALIKE)
+                )
                 total += shares[number]
             for number in range(4):
                 shares[number] /= total
@@ -258,6 +282,42 @@ def _besides_itself(first, last, alone, known, mixed):
             cell, own = mixed[row, column], known[row, column]
             for i in range(mixed.shape[2]):
                 cell[i] += itself * (own[i] - cell[i])
+
+
+# --- how bright pixels are ----------------------------------------------------------------------
+
+
+@compiled
+def _shaded(first, last, view, kin, coarse, channels, bright, square):
+    """Write the brightness of kin, and by how much cells differ from it, squared over the noise."""
+    below, right = coarse.shape[0] - 1, coarse.shape[1] - 1
+    for row in range(first, last):
+        up, down = max((row - 1) // 2, 0), min((row + 1) // 2, below)
+        for column in range(view.shape[1]):
+            before, after = max((column - 1) // 2, 0), min((column + 1) // 2, right)
+            mix(kin[row, column], coarse, up, down, before, after, bright[row, column], 2)
+            noise, own = view[row, column, 0], view[row, column, 1]
+            apart = ONE - bright[row, column, 0] / own
+            square[row, column] = apart * apart / min(noise / channels, ONE)
+
+
+@compiled
+def _brightened(first, last, view, square, channels, bright):
+    """Write what `evidence.brightened` returns over the brightness of kin."""
+    height, width = square.shape
+    for row in range(first, last):
+        top, bottom = max(row - 1, 0), min(row + 2, height)
+        for column in range(width):
+            left, right = max(column - 1, 0), min(column + 2, width)
+            around = np.float32(0)
+            for y in range(top, bottom):
+                for x in range(left, right):
+                    around += square[y, x]
+            around *= _AROUND / ((bottom - top) * (right - left))
+            heard = ONE - ONE / max(around, square[row, column] * _ITSELF, ONE)
+            cell, noise = bright[row, column], min(view[row, column, 0] / channels, ONE)
+            cell[0] += heard * (view[row, column, 1] - cell[0])
+            cell[1] = heard * noise + (ONE - heard) * (ONE - heard) * cell[1]
 
 
 # --- all of it ----------------------------------------------------------------------------------
@@ -333,11 +393,16 @@ def gather_evidence(
         run(_among_neighbours, len(view), view, camera.power, known[-1])
 
     best = spectral = known[-1]
+    noise = np.minimum(best[..., 0] / camera.channels, ONE)
+    bright = np.stack([best[..., 1], noise], -1)
     kin, alone = {}, {}
     for level in reversed(range(LEVELS)):
         kin[level], alone[level] = empty(level, 4), empty(level)
         view, rows = views[level], len(views[level])
         run(_kinship, rows, view, known[level], best, camera.power, kin[level], alone[level])
+        coarse, bright, square = bright, empty(level, 2), empty(level)
+        run(_shaded, rows, view, kin[level], coarse, camera.channels, bright, square)
+        run(_brightened, rows, view, square, camera.channels, bright)
         if level == 0:
             break
         mixed = empty(level, 2 + (size if level >= SPECTRAL else TOLD))
@@ -370,7 +435,7 @@ def gather_evidence(
     own = [empty(level, CORRECTED[level]) for level in range(SPECTRAL)]
     for level, (view, place) in enumerate(zip(known[:SPECTRAL], places, strict=False)):
         matrices = camera.vectors, camera.spread, camera.gains[level]
-        run(wiener, len(view), view, place, misfit, *matrices, own[level])
+        run(wiener, len(view), view, place, alone[level], misfit, *matrices, own[level])
 
     def pictures(values: Iterable[np.ndarray]) -> list[Tensor]:
         return [torch.from_numpy(value)[None] for value in values]
@@ -388,6 +453,7 @@ def gather_evidence(
         pixels=seen(views[0]),
         cells=seen(views[SPECTRAL]),
         spectral=seen(spectral),
+        bright=Brightness(*pictures((bright[..., 0], bright[..., 1]))),
     )
 
 

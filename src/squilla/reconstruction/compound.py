@@ -280,7 +280,7 @@ class Compound(Reconstructor):
             known = torch.where(finite, lit.float(), torch.nan)
             y, ratio = torch.where(finite[..., None], y, 0), torch.where(lit, ratio, torch.inf)
             seen = self._torch_evidence(y, ratio, camera, zone, levels)
-        amplitude = (seen.pixels.amplitude[:, :height, :width] * known)[..., None]
+        amplitude = (seen.bright.amplitude[:, :height, :width] * known)[..., None]
         x = (descend(seen)[:, :height, :width] * amplitude) @ self.basis
         if not interval:
             return x.relu_(), None

@@ -36,6 +36,12 @@ CORRECTED = (16, 32)
 ALIKE = 1e-6
 """Variance by which shapes may differ and still be of one spectrum."""
 
+SHADED, UNALIKE = 0.1, 1.0
+"""Usual difference in brightness of neighbours, relative, if they show one surface, or two."""
+
+TEXTURE = (1.5, 9.0)
+"""Squared differences of brightness, over the noise's, that are believed: a mean of 9, and one."""
+
 UNHEARD = 1e-3
 """What a cell says by itself is not heard if it counts for less."""
 
@@ -80,6 +86,9 @@ class Camera:
         """The posteriors, zone by zone."""
         seen = kept[:, :TOLD].T @ seen / unit
         moment = prior.moment * (len(white) / (seen @ prior.moment @ seen.T).trace())
+        amplitude = flat @ mean @ prior.basis
+        shared = moment @ amplitude
+        moment = moment - shared[:, None] * shared / (amplitude @ shared)  # all of one amplitude
         power = (seen @ moment @ seen.T).diagonal().clamp_min(1e-12)
         self.power = power.float()
         """(TOLD,), variance of shapes in the leading directions."""
@@ -144,8 +153,10 @@ def coarser(view: View, camera: Camera) -> View:
     both = noise[..., :, None] + noise[..., None, :] + 2 * ALIKE
     scale, against = _telling(both, camera)
     differ = ((told[..., :, None, :] - told[..., None, :, :]).square() * scale).sum(-1)
+    lit = joined[..., -1]
+    alike = against - differ + _alike_in_brightness(lit[..., :, None], lit[..., None, :]).log()
     itself = torch.eye(4, dtype=torch.bool, device=noise.device)
-    share = torch.sigmoid(against - differ).masked_fill(itself, 1.0) / noise[..., None, :]
+    share = torch.sigmoid(alike).masked_fill(itself, 1.0) / noise[..., None, :]
     certainty, most = share.sum(-1).max(-1)
     share = share.gather(-2, most[..., None, None].expand(*most.shape, 1, 4))
     mean = (share @ joined)[..., 0, :] / certainty[..., None]
@@ -164,8 +175,9 @@ def among_neighbours(view: View, camera: Camera) -> View:
     total = content * weight[..., None]
     for dy, dx in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
         other = around[:, dy : dy + h, dx : dx + w]
-        differ = ((other[..., :TOLD] - told).square() * scale).sum(-1) - against
-        share = torch.sigmoid(-differ) * other[..., -1]
+        differ = ((other[..., :TOLD] - told).square() * scale).sum(-1)
+        lit = _alike_in_brightness(other[..., -2], view.amplitude).log()
+        share = torch.sigmoid(against - differ + lit) * other[..., -1]
         total = torch.addcmul(total, share[..., None], other[..., : size + 1])
         weight = weight + share
     total = total / weight[..., None]
@@ -194,8 +206,8 @@ def kinship(view: View, own: View, coarse: View, camera: Camera) -> tuple[Tensor
         Log odds of the cell itself against all of them.
     """
     told = view.shape[..., :TOLD]
-    around = _edged(torch.cat([coarse.shape[..., :TOLD], coarse.noise[..., None]], -1))
-    mean = functional.avg_pool2d(around[..., -1], 2, 1)  # of the four around each corner
+    around = _edged(coarse.joined(TOLD))
+    mean = functional.avg_pool2d(around[..., -2], 2, 1)  # of the four around each corner
     phases = []
     for (y, x), phase, cells in _four(*view.noise.shape[1:]):
         h, w = coarse.noise.shape[1:]
@@ -204,8 +216,9 @@ def kinship(view: View, own: View, coarse: View, camera: Camera) -> tuple[Tensor
         logs = []
         for cell in cells:
             other = around[cell]
-            differ = ((other[..., :-1] - told[phase]).square() * scale).sum(-1) - against
-            logs.append(-differ - (other[..., -1] + ALIKE).log())
+            differ = ((other[..., :TOLD] - told[phase]).square() * scale).sum(-1)
+            lit = _alike_in_brightness(other[..., -1], view.amplitude[phase])
+            logs.append(against - differ + (lit / (other[..., -2] + ALIKE)).log())
         logs = torch.stack(logs, -1)
         alone = -(own.noise[phase] + ALIKE).log() - torch.logsumexp(logs, -1)
         phases.append(torch.cat([torch.softmax(logs, -1), alone[..., None]], -1))
@@ -224,6 +237,15 @@ def _telling(noise: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """
     share = 2 * camera.power / noise[..., None]
     return share / (1 + share) / (2 * noise[..., None]), torch.log1p(share).sum(-1) / 2
+
+
+def _alike_in_brightness(one: Tensor, other: Tensor) -> Tensor:
+    """Return how much likelier two amplitudes are of one surface than of two.
+
+    Shadows and gloss are rare and large, so the differences are taken to have Cauchy densities.
+    """
+    apart = (2 * (one - other) / (one + other)).square()
+    return SHADED / UNALIKE * (UNALIKE**2 + apart) / (SHADED**2 + apart)
 
 
 def inherit(kin: Tensor, coarse: Tensor) -> Tensor:
@@ -266,6 +288,41 @@ def _interleaved(phases: list[Tensor]) -> Tensor:
     return torch.stack(rows, 2).view(b, 2 * h, 2 * w, c)
 
 
+# --- how bright pixels are ----------------------------------------------------------------------
+
+
+@dataclass
+class Brightness:
+    """Amplitudes without the noise that kin do not share.
+
+    amplitude : (B, H, W).
+    variance : (B, H, W) of that, relative to its square.
+    """
+
+    amplitude: Tensor
+    variance: Tensor
+
+
+def brightened(view: View, kin: Tensor, coarse: Brightness, camera: Camera) -> Brightness:
+    """Return the brightness of cells, from that of the coarse ones and what they measured.
+
+    A cell keeps as much of its difference from its kin as noise alone does not explain: in the
+    mean of the differences around it, or of its own.
+
+    Source: J.-S. Lee, IEEE Trans. Pattern Anal. Mach. Intell. 2, 165 (1980): local statistics.
+    """
+    both = inherit(kin, torch.stack([coarse.amplitude, coarse.variance], -1))
+    smooth, variance = both.unbind(-1)
+    apart = view.amplitude - smooth
+    noise = (view.noise / camera.channels).clamp_max(1)
+    square = (apart / view.amplitude).square() / noise
+    around = functional.avg_pool2d(square[:, None], 3, 1, 1, count_include_pad=False)[:, 0]
+    heard = 1 - 1 / torch.maximum(around / TEXTURE[0], square / TEXTURE[1]).clamp_min(1)
+    return Brightness(
+        torch.addcmul(smooth, heard, apart), heard * noise + (1 - heard).square() * variance
+    )
+
+
 # --- all of it ----------------------------------------------------------------------------------
 
 
@@ -280,6 +337,7 @@ class Evidence:
     own_noise : noise variance of that, (B, H, W).
     pixels, cells : what was measured at level 0 and at the level SPECTRAL.
     spectral : from what the spectra were inferred.
+    bright : of the pixels.
     """
 
     coefficients: Tensor
@@ -291,6 +349,7 @@ class Evidence:
     pixels: View
     cells: View
     spectral: View
+    bright: Brightness
 
 
 def gather_evidence(
@@ -322,9 +381,11 @@ def gather_evidence(
     known = [views[0], *(among_neighbours(view, camera) for view in views[1:])]
     lowest = min(SPECTRAL, levels)
     best = spectral = known[-1]
+    bright = Brightness(best.amplitude, (best.noise / camera.channels).clamp_max(1))
     kin, alone = [], []
     for level in reversed(range(levels)):
         shares, odds = kinship(views[level], known[level], best, camera)
+        bright = brightened(views[level], shares, bright, camera)
         if level < lowest:
             kin.insert(0, shares)
             alone.insert(0, odds)
@@ -350,7 +411,9 @@ def gather_evidence(
             camera.zones, place, view.shape, noise,
         )  # fmt: skip
         own += one
-    return Evidence(mean, variance, kin, alone, own, own_noise, views[0], views[lowest], spectral)
+    return Evidence(
+        mean, variance, kin, alone, own, own_noise, views[0], views[lowest], spectral, bright
+    )
 
 
 def measured_misfit(spectral: View, camera: Camera, zone: Tensor | None) -> Tensor:

@@ -26,9 +26,6 @@ from squilla.reconstruction.evidence import (
 NINETY = 1.645
 """Half the width of the central 90 % of a normal distribution, in standard deviations."""
 
-MISTAKEN = 0.3
-"""Variance that kin mistaken for the same add in a leading direction, as a share of their noise."""
-
 SURE = (2.0, 3.0)
 """Standard errors from which differences among kin are believed: all as one, and each."""
 
@@ -39,10 +36,14 @@ def descend(seen: Evidence) -> Tensor:
     for level in reversed(range(len(seen.own))):
         x = inherit(seen.kin[level], x)
         own = seen.own[level]
-        itself = torch.sigmoid(seen.alone[level])[..., None]
-        heard = torch.where(itself < UNHEARD, 0, itself)
-        x[..., : own.shape[-1]].lerp_(own, heard)
+        x[..., : own.shape[-1]].lerp_(own, heard(seen.alone[level]))
     return x
+
+
+def heard(alone: Tensor) -> Tensor:
+    """Return how much cells count by themselves, from log odds, (B, H, W) -> (B, H, W, 1)."""
+    itself = torch.sigmoid(alone)[..., None]
+    return torch.where(itself < UNHEARD, 0, itself)
 
 
 def half_width(seen: Evidence, camera: Camera, zone: Tensor | None = None) -> Tensor:
@@ -61,10 +62,6 @@ def half_width(seen: Evidence, camera: Camera, zone: Tensor | None = None) -> Te
     """
     knots = camera.zones[0].knots
     x, variance = seen.coefficients, seen.variance
-    if seen.own:
-        mistaken = MISTAKEN * seen.spectral.noise[..., None]
-        mistaken = mistaken * camera.power / (mistaken + camera.power)
-        variance = variance + mistaken[..., 1:] @ camera.shown[1:]
     for level in reversed(range(len(seen.own))):
         own, kin = seen.own[level], seen.kin[level]
         size = own.shape[-1]
@@ -76,16 +73,15 @@ def half_width(seen: Evidence, camera: Camera, zone: Tensor | None = None) -> Te
             lambda one, _, noise: (one.wiener_variance(noise),),
             camera.zones, coarse_zone(zone, 2**level), own, seen.own_noise[level],
         )  # fmt: skip
-        itself = torch.sigmoid(seen.alone[level])[..., None]
+        itself = heard(seen.alone[level])
         apart = own - x[..., :size]
         between = itself * (1 - itself) * (apart @ knots[:size]).square()
         variance = torch.lerp(variance, left, itself) + between
         x[..., :size] += itself * apart
     if len(seen.own) == SPECTRAL and min(seen.cells.noise.shape[1:]) >= 2 ** (LEVELS - SPECTRAL):
-        variance = variance + (unlikeness(seen, camera)[:, 1:] @ camera.shown[1:])[:, None, None]
-    # The noise of a channel, relative to the signal, is M times that of the amplitude.
-    bright = seen.pixels.noise[..., None] / camera.channels
-    return NINETY * (variance.clamp_min(1e-10) + bright * (x @ knots).square()).sqrt()
+        variance = variance + (unlikeness(seen, camera) @ camera.shown)[:, None, None]
+    bright = seen.bright.variance[..., None] * (x @ knots).square()
+    return NINETY * (variance.clamp_min(1e-10) + bright).sqrt()
 
 
 def unlikeness(seen: Evidence, camera: Camera) -> Tensor:
@@ -103,8 +99,7 @@ def unlikeness(seen: Evidence, camera: Camera) -> Tensor:
     """
     told = torch.cat([seen.spectral.shape[..., :TOLD], seen.spectral.noise[..., None]], -1)
     excess, error = _excess(seen.cells, told)
-    power = camera.power.clone()
-    power[0] = 0  # along the amplitude, by which shapes were divided
+    power = camera.power
     total = (excess @ power) / power.square().sum()
     found = _believed(total, error / power.norm(), SURE[0])[:, None] * power
     found = found + _believed(excess - found, error[:, None], SURE[1])

@@ -46,15 +46,10 @@ def sigmoid(x):
     return ONE / (ONE + math.exp(-x))
 
 
-def times(first: int, last: int, picture: np.ndarray, matrix: np.ndarray, product: np.ndarray):
-    """Multiply every cell of some rows by a matrix."""
-    np.matmul(picture[first:last], matrix, out=product[first:last])
-
-
 def over_rows(kernel: Callable[..., None], rows: int, threads: int, *arguments) -> None:
     """Call a kernel for all rows, shared by threads."""
     # Twice as many parts as threads, since the machine may have other work; but no small ones.
-    parts = min(rows // 8, 4 * threads)
+    parts = min(rows // 32, 2 * threads)
     if threads == 1 or parts < 2:
         kernel(0, rows, *arguments)
         return

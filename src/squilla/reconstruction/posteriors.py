@@ -8,10 +8,12 @@ import math
 import numpy as np
 
 from squilla.reconstruction.estimators import BEYOND, LEADING, QUIETEST
-from squilla.reconstruction.evidence import CORRECTED, Camera
+from squilla.reconstruction.evidence import CORRECTED, UNHEARD, Camera
 from squilla.reconstruction.kernels import ONE, add_product, compiled
 
 _BEYOND = np.float32(BEYOND)
+
+_HEARD = np.float32(math.log(UNHEARD / (1 - UNHEARD)))
 
 _LIKELY = np.float32(1e-6)
 """Clusters less likely than this leave no trace in a posterior."""
@@ -67,22 +69,36 @@ def by_zone(first, last, view, zone, matrices, product):
 
 
 @compiled
-def wiener(first, last, view, zone, misfit, vectors, power, gain, own):
-    """Write the linear estimate of `Estimators.wiener`, as many coefficients as `own` has."""
-    score = np.empty((1, view.shape[1], vectors.shape[2]), np.float32)
+def wiener(first, last, view, zone, alone, misfit, vectors, power, gain, own):
+    """Write the linear estimate of `Estimators.wiener`, as many coefficients as `own` has.
+
+    Of cells that are not heard, by the log odds `alone`, it is left at zero.
+    """
+    width, size = zone.shape[1], own.shape[2]
+    heard = np.empty(width, np.int64)
+    shape = np.empty((width, vectors.shape[1]), np.float32)
+    score = np.empty((width, vectors.shape[2]), np.float32)
+    estimate = np.empty((width, size), np.float32)
     for row in range(first, last):
-        here, places = view[row : row + 1], zone[row : row + 1]
-        by_zone(0, 1, here, places, vectors, score)
-        start = 0
-        while start < view.shape[1]:
-            where, stop = zone[row, start], start
-            while stop < view.shape[1] and zone[row, stop] == where:
-                cell, noise = score[0, stop], view[row, stop, 0] + misfit
-                for i in range(cell.size):
-                    cell[i] /= power[where, i] + noise
-                stop += 1
-            np.dot(score[0][start:stop], gain[where], own[row][start:stop])
-            start = stop
+        own[row] = 0
+        column = 0
+        while column < width:
+            where, count = zone[row, column], 0
+            while column < width and zone[row, column] == where:
+                if alone[row, column] >= _HEARD:
+                    heard[count], shape[count] = column, view[row, column, 2:]
+                    count += 1
+                column += 1
+            if not count:
+                continue
+            np.dot(shape[:count], vectors[where], score[:count])
+            for k in range(count):
+                noise = view[row, heard[k], 0] + misfit
+                for i in range(score.shape[1]):
+                    score[k, i] /= power[where, i] + noise
+            np.dot(score[:count], gain[where], estimate[:count])
+            for k in range(count):
+                own[row, heard[k]] = estimate[k]
 
 
 @compiled

@@ -1,0 +1,71 @@
+"""How well the 90 % interval is kept, over many scenes: each of 24 colours under one lamp.
+
+    python benchmarks/cover.py [--scenes 200]
+
+Reflectances and lamps are those that the prior has never learnt from; every scene has a lamp, an
+array of the thesis' recipe and 24 mixtures of reflectances of its own. One scene shows how the
+errors of some 24 spectra, which share a lamp, compare with what was expected of all: so its cover
+scatters, whatever the interval. Writes experiments/results/cover.json.
+"""
+
+import argparse
+import json
+import os
+import platform
+from pathlib import Path
+
+import numpy as np
+import torch
+from accuracy import WAVELENGTH, random_array
+from torch import Generator, Tensor
+
+from squilla.reconstruction.models import load_model
+from squilla.training.noise import add_noise
+from squilla.training.prior import Palette
+
+RESULTS = Path(__file__).parents[1] / "experiments" / "results" / "cover.json"
+SIDE = 32
+"""Side of a patch, px."""
+FIRST = 3000
+"""Seed of the first array; those of the table of accuracy are others."""
+
+
+def chart(palette: Palette, lamp: int, generator: Generator) -> Tensor:
+    """Return 4 x 6 patches of random colours under one lamp, (128, 192, K)."""
+    colours = palette.natural(torch.full((24,), lamp), generator)
+    label = torch.arange(24).view(4, 6).repeat_interleave(SIDE, 0).repeat_interleave(SIDE, 1)
+    return colours[label]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The cover of the 90 % interval, scene by scene.")
+    parser.add_argument("--scenes", type=int, default=200)
+    options = parser.parse_args()
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1)))
+    palette = Palette(WAVELENGTH, held_out=True, seed=5, count=10)
+    generator = Generator().manual_seed(9)
+    covers: dict[int, list[float]] = {20: [], 30: [], 40: []}
+    for scene in range(options.scenes):
+        model = load_model("compound", random_array(FIRST + scene))
+        lamp = int(torch.randint(len(palette.lamp), (), generator=generator))
+        truth = chart(palette, lamp, generator)
+        for snr, found in covers.items():
+            y = add_noise(model.calibration.project(truth), snr, generator)
+            with torch.inference_mode():
+                x, width = model.with_interval(y, snr=float(snr))
+            found.append(float(((x - truth).abs() <= width).float().mean()))
+    story: dict = {"machine": platform.machine(), "scenes": options.scenes, "lamps": len(palette.lamp)}
+    for snr, found in covers.items():
+        near = np.abs(np.array(found) - np.mean(found)) <= 0.03
+        story[f"{snr} dB"] = {
+            "mean": round(float(np.mean(found)), 4),
+            "standard deviation": round(float(np.std(found)), 4),
+            "from 87 to 93 %": float(np.mean([0.87 <= one <= 0.93 for one in found])),
+            "within 3 points of the mean": float(near.mean()),
+        }
+        print(f"{snr} dB:", story[f"{snr} dB"])
+    RESULTS.write_text(json.dumps(story, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
