@@ -173,10 +173,13 @@ def _coarser(first, last, fine, power, view):
                 fine[2 * row, 2 * column], fine[2 * row, 2 * column + 1],
                 fine[2 * row + 1, 2 * column], fine[2 * row + 1, 2 * column + 1],
             )  # fmt: skip
+            certainty = np.float32(0)
+            for part in parts:
+                certainty += ONE / part[0]
+            against = _telling(8 / certainty + 2 * _ALIKE, power, scale)
             for i in range(4):
                 share[i, i] = ONE / parts[i][0]
                 for j in range(i):
-                    against = _telling(parts[i][0] + parts[j][0] + 2 * _ALIKE, power, scale)
                     apart = _difference(parts[i], parts[j], scale)
                     lit = _alike_in_brightness(parts[i], parts[j])
                     alike = _probability(against - apart, lit)

@@ -150,11 +150,12 @@ def coarser(view: View, camera: Camera) -> View:
     joined = parts(torch.cat([view.shape, view.amplitude[..., None]], -1))
     noise = parts(view.noise)[..., 0]
     told = joined[..., :TOLD]
-    both = noise[..., :, None] + noise[..., None, :] + 2 * ALIKE
-    scale, against = _telling(both, camera)
-    differ = ((told[..., :, None, :] - told[..., None, :, :]).square() * scale).sum(-1)
-    lit = joined[..., -1]
-    alike = against - differ + _alike_in_brightness(lit[..., :, None], lit[..., None, :]).log()
+    # The quietest count most: of noisy ones among them, it hardly matters what they show.
+    scale, against = _telling(8 / (1 / noise).sum(-1) + 2 * ALIKE, camera)
+    apart = (told[..., :, None, :] - told[..., None, :, :]).square()
+    differ = (apart * scale[..., None, None, :]).sum(-1)
+    lit = _alike_in_brightness(joined[..., :, None, -1], joined[..., None, :, -1])
+    alike = against[..., None, None] - differ + lit.log()
     itself = torch.eye(4, dtype=torch.bool, device=noise.device)
     share = torch.sigmoid(alike).masked_fill(itself, 1.0) / noise[..., None, :]
     certainty, most = share.sum(-1).max(-1)
