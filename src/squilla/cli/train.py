@@ -33,8 +33,8 @@ def train(
     dropped: Annotated[float, typer.Option(help="Probability that a channel is lost.")] = 0.0,
     spectra: Annotated[str, typer.Option(help="Prior: broad, gaussian, natural, line.")] = "broad",
     count: Annotated[
-        int, typer.Option(help="Spectra in an epoch; compound learns from 60000 unless told.")
-    ] = 8000,
+        int | None, typer.Option(help="Spectra in an epoch; 8000, of compound 60000.")
+    ] = None,
     epochs: Annotated[int, typer.Option(help="Passes over as many spectra.")] = 500,
     batch: Annotated[int, typer.Option(help="Spectra in a step.")] = 1024,
     learning_rate: Annotated[float, typer.Option(help="Of Adam.")] = 1e-4,

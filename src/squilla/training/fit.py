@@ -22,9 +22,13 @@ from squilla.reconstruction.reconstructor import Reconstructor
 from squilla.reconstruction.weights import fingerprint
 from squilla.training.data import Samples
 from squilla.training.noise import Noise, SensorNoise
+from squilla.training.prior import LEARNT, learn_prior
 from squilla.training.processes import Processes, joined
 
 Precision = Literal["float32", "tf32", "bfloat16"]
+
+EPOCH = 8000
+"""Spectra in an epoch."""
 
 CHECKPOINTING = 0.02
 """Part of the time that may go into writing checkpoints."""
@@ -47,7 +51,7 @@ def train(
     gain_error: float = 0.0,
     dropped: float = 0.0,
     spectra: str = "broad",
-    count: int = 8000,
+    count: int | None = None,
     fresh: bool = True,
     epochs: int = 500,
     batch: int = 1024,
@@ -69,8 +73,8 @@ def train(
     ----------
     name : str
         A network of `models`: "mlp", "cnn", "rescnn", "unet", "respecnn"; or "compound", which
-        learns its prior anew on the camera's wavelengths (`training.prior`) from `count` spectra,
-        60 000 unless told: it takes `seed` and `device` too, and refuses what shapes a training.
+        learns its prior anew on the camera's wavelengths (`training.prior`) from `count` spectra:
+        it takes `seed` and `device` too, and refuses what shapes a training.
     calibration : Calibration
         With several field angles, every sample gets one at random.
     noise : None, float, (float, float) or SensorNoise
@@ -84,8 +88,8 @@ def train(
         others.
     spectra : str
         What to train on, a key of spectra.PRIORS: "broad" (default), or "gaussian" as the thesis.
-    count : int
-        Spectra in an epoch.
+    count : int, optional
+        Spectra in an epoch, 8000 unless told; "compound" learns from 60 000 unless told.
     fresh : bool
         Draw new spectra for every epoch; the thesis keeps one set (False).
     epochs, batch : int
@@ -127,6 +131,8 @@ def train(
     kind = model_class(name)
     if not kind.trained:
         raise InputError(f"`{name}` is computed from the calibration and needs no training.")
+    if count is None:
+        count = LEARNT if kind.universal else EPOCH
     if min(count, epochs, batch) < 1 or not 0 < learning_rate < math.inf:
         raise InputError(
             f"{epochs} epochs of {count} spectra in batches of {batch} at a learning rate of "
@@ -139,7 +145,6 @@ def train(
             raise InputError(f"{file} cannot be written: there is no such folder; make it first.")
     if kind.universal:
         from squilla.reconstruction.compound import Compound
-        from squilla.training.prior import LEARNT, learn_prior
 
         own = {
             "noise": noise, "gain_error": gain_error, "dropped": dropped, "spectra": spectra,
@@ -156,13 +161,11 @@ def train(
         with joined(device) as processes:
             if processes.count > 1:
                 raise InputError(f"`{name}` is learnt by one process; start it without torchrun.")
-            # By default as many as the model that ships has seen.
-            number = LEARNT if count == usual["count"].default else count
             prior = learn_prior(
-                calibration.wavelength, count=number, seed=seed, device=processes.device
+                calibration.wavelength, count=count, seed=seed, device=processes.device
             )
         model = Compound(calibration, prior).eval()
-        model.provenance = {"count": number, "seed": seed, "clusters": prior.learnt}
+        model.provenance = {"count": count, "seed": seed, "clusters": prior.learnt}
         return model
     samples = Samples(calibration, spectra, count, noise, gain_error, dropped, fresh, seed)
     settings = {
