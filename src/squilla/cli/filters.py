@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from squilla.optics.tables import MeasuredFilters
 
 app = typer.Typer(
-    help="Look at filter arrays, design them, try their faults.", no_args_is_help=True
+    help="Look at filter arrays, design them, see what faults cost.", no_args_is_help=True
 )
 
 SnrOption = Annotated[

@@ -19,6 +19,7 @@ from squilla.reconstruction.evidence import (
     FEW,
     LEVELS,
     MISFITS,
+    NOTHING,
     SAMPLE,
     SHADED,
     SPECTRAL,
@@ -36,6 +37,7 @@ from squilla.threads import single_threaded_products
 
 _HALF, _ALIKE = np.float32(0.5), np.float32(ALIKE)
 _SHADED, _UNALIKE = np.float32(SHADED), np.float32(UNALIKE)
+_NOTHING = np.float32(NOTHING)
 _AROUND, _ITSELF = np.float32(1 / TEXTURE[0]), np.float32(1 / TEXTURE[1])
 _ROWS = 16
 """Rows of a picture that are worked on at a time where a step leaves something to the next."""
@@ -292,16 +294,21 @@ def _besides_itself(first, last, alone, known, mixed):
 
 @compiled
 def _shaded(first, last, view, kin, coarse, channels, bright, square):
-    """Write the brightness of kin, and by how much cells differ from it, squared over the noise."""
+    """Write the brightness of kin, and by how much cells differ from it, squared over the noise.
+
+    Of cells that have measured nothing the difference is -1.
+    """
     below, right = coarse.shape[0] - 1, coarse.shape[1] - 1
     for row in range(first, last):
         up, down = max((row - 1) // 2, 0), min((row + 1) // 2, below)
         for column in range(view.shape[1]):
             before, after = max((column - 1) // 2, 0), min((column + 1) // 2, right)
             mix(kin[row, column], coarse, up, down, before, after, bright[row, column], 2)
-            noise, own = view[row, column, 0], view[row, column, 1]
-            apart = ONE - bright[row, column, 0] / own
+            noise, own, smooth = view[row, column, 0], view[row, column, 1], bright[row, column, 0]
+            apart = (own - smooth) / min(own, smooth)
             square[row, column] = apart * apart / min(noise / channels, ONE)
+            if noise >= _NOTHING:
+                square[row, column] = -ONE
 
 
 @compiled
@@ -309,18 +316,21 @@ def _brightened(first, last, view, square, channels, bright):
     """Write what `evidence.brightened` returns over the brightness of kin."""
     height, width = square.shape
     for row in range(first, last):
-        top, bottom = max(row - 1, 0), min(row + 2, height)
         for column in range(width):
-            left, right = max(column - 1, 0), min(column + 2, width)
-            around = np.float32(0)
-            for y in range(top, bottom):
-                for x in range(left, right):
-                    around += square[y, x]
-            around *= _AROUND / ((bottom - top) * (right - left))
-            heard = ONE - ONE / max(around, square[row, column] * _ITSELF, ONE)
-            cell, noise = bright[row, column], min(view[row, column, 0] / channels, ONE)
-            cell[0] += heard * (view[row, column, 1] - cell[0])
-            cell[1] = heard * noise + (ONE - heard) * (ONE - heard) * cell[1]
+            own, cell = square[row, column], bright[row, column]
+            if own < 0:
+                continue
+            around, count = np.float32(0), np.float32(0)
+            for y in range(max(row - 1, 0), min(row + 2, height)):
+                for x in range(max(column - 1, 0), min(column + 2, width)):
+                    if square[y, x] >= 0:
+                        around += square[y, x]
+                        count += ONE
+            around /= count
+            kept = ONE - ONE / max(around * _AROUND, own * _ITSELF, ONE)
+            noise = min(view[row, column, 0] / channels, ONE)
+            cell[0] += kept * (view[row, column, 1] - cell[0])
+            cell[1] = kept * noise + (ONE - kept) * (ONE - kept) * cell[1]
 
 
 # --- all of it ----------------------------------------------------------------------------------

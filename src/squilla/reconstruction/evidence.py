@@ -40,7 +40,13 @@ SHADED, UNALIKE = 0.1, 1.0
 """Usual difference in brightness of neighbours, relative, if they show one surface, or two."""
 
 TEXTURE = (1.5, 9.0)
-"""Squared differences of brightness, over the noise's, that are believed: a mean of 9, and one."""
+"""Squared differences of brightness, over the noise's, that may be chance.
+
+In the mean over 3 x 3 cells, one standard deviation above what noise makes; of one cell, three.
+"""
+
+NOTHING = 1e3
+"""Noise variance of cells that have measured nothing."""
 
 UNHEARD = 1e-3
 """What a cell says by itself is not heard if it counts for less."""
@@ -90,10 +96,11 @@ class Camera:
         shared = moment @ amplitude
         moment = moment - shared[:, None] * shared / (amplitude @ shared)  # all of one amplitude
         power = (seen @ moment @ seen.T).diagonal().clamp_min(1e-12)
-        self.power = power.float()
-        """(TOLD,), variance of shapes in the leading directions."""
         self.shown = ((prior.knots @ moment @ seen.T) / power).square().T.float()
         """(TOLD, KNOTS), variance of spectra that differ by one in a leading direction."""
+        self.power = power.float()
+        """(TOLD,), variance of shapes in the leading directions, as if each stood alone."""
+        self.power[0], self.shown[0] = 0, 0  # along the amplitude, nearly, all shapes are alike
         self.misfits = torch.from_numpy(MISFITS).float()
         self.quiet = vectors[:, -(len(white) // 2) :].float()
         """(M, M // 2), directions that hardly any spectrum reaches: what they see is noise."""
@@ -307,20 +314,34 @@ class Brightness:
 def brightened(view: View, kin: Tensor, coarse: Brightness, camera: Camera) -> Brightness:
     """Return the brightness of cells, from that of the coarse ones and what they measured.
 
-    A cell keeps as much of its difference from its kin as noise alone does not explain: in the
-    mean of the differences around it, or of its own.
+    A cell keeps as much of its difference from its kin as is more than chance: by the mean of the
+    differences around it, or by its own. Texture weaker than the noise is lost.
 
-    Source: J.-S. Lee, IEEE Trans. Pattern Anal. Mach. Intell. 2, 165 (1980): local statistics.
+    Parameters
+    ----------
+    view : View
+        What the cells measured.
+    kin : Tensor, (B, H, W, 4)
+        Shares of the coarse cells, of `kinship`.
+    coarse : Brightness
+        Half the size.
+    camera : Camera
+
+    Source: after J.-S. Lee, IEEE Trans. Pattern Anal. Mach. Intell. 2, 165 (1980): a filter by
+    local statistics.
     """
     both = inherit(kin, torch.stack([coarse.amplitude, coarse.variance], -1))
     smooth, variance = both.unbind(-1)
     apart = view.amplitude - smooth
     noise = (view.noise / camera.channels).clamp_max(1)
-    square = (apart / view.amplitude).square() / noise
-    around = functional.avg_pool2d(square[:, None], 3, 1, 1, count_include_pad=False)[:, 0]
-    heard = 1 - 1 / torch.maximum(around / TEXTURE[0], square / TEXTURE[1]).clamp_min(1)
+    known = (view.noise < NOTHING).float()
+    square = known * (apart / torch.minimum(view.amplitude, smooth)).square() / noise
+    sums = functional.avg_pool2d(torch.stack([square, known], 1), 3, 1, 1)
+    around = sums[:, 0] / sums[:, 1].clamp_min(0.1)  # at least one of nine
+    kept = 1 - 1 / torch.maximum(around / TEXTURE[0], square / TEXTURE[1]).clamp_min(1)
+    kept = kept * known
     return Brightness(
-        torch.addcmul(smooth, heard, apart), heard * noise + (1 - heard).square() * variance
+        torch.addcmul(smooth, kept, apart), kept * noise + (1 - kept).square() * variance
     )
 
 
@@ -334,7 +355,8 @@ class Evidence:
     coefficients : (B, H, W, C) at the level SPECTRAL, posterior mean.
     variance : (B, H, W, KNOTS) there, of the spectrum at the knots.
     kin, alone : of `kinship` for the levels below, finest first.
-    own : what the cells of these levels say by themselves, (B, H, W, CORRECTED[level]).
+    own : what the cells of these levels say by themselves, (B, H, W, CORRECTED[level]); compiled
+        loops leave zeros where nobody hears it.
     own_noise : noise variance of that, (B, H, W).
     pixels, cells : what was measured at level 0 and at the level SPECTRAL.
     spectral : from what the spectra were inferred.

@@ -49,7 +49,7 @@ def sigmoid(x):
 def over_rows(kernel: Callable[..., None], rows: int, threads: int, *arguments) -> None:
     """Call a kernel for all rows, shared by threads."""
     # Twice as many parts as threads, since the machine may have other work; but no small ones.
-    parts = min(rows // 32, 2 * threads)
+    parts = min(rows // 8, 2 * threads)
     if threads == 1 or parts < 2:
         kernel(0, rows, *arguments)
         return

@@ -14,6 +14,7 @@ from squilla.reconstruction.kernels import ONE, add_product, compiled
 _BEYOND = np.float32(BEYOND)
 
 _HEARD = np.float32(math.log(UNHEARD / (1 - UNHEARD)))
+"""Log odds from which on a cell is heard by itself."""
 
 _LIKELY = np.float32(1e-6)
 """Clusters less likely than this leave no trace in a posterior."""
