@@ -327,6 +327,10 @@ def brightened(view: View, kin: Tensor, coarse: Brightness, camera: Camera) -> B
         Half the size.
     camera : Camera
 
+    Returns
+    -------
+    Brightness
+
     Source: after J.-S. Lee, IEEE Trans. Pattern Anal. Mach. Intell. 2, 165 (1980): a filter by
     local statistics.
     """
