@@ -298,8 +298,10 @@ def test_senseless_settings_are_refused():
         train("ridge", CAMERA)
     with pytest.raises(InputError, match="positive"):
         train("mlp", CAMERA, epochs=0)
-    with pytest.raises(InputError, match="positive"):
+    with pytest.raises(InputError, match="too few to learn from"):
         train("compound", CAMERA, count=-1)
+    with pytest.raises(InputError, match="leave out epochs"):
+        train("compound", CAMERA, epochs=0)
     for noise in ([15, 20], "20", (15.0, 20.0, 25.0)):
         with pytest.raises(InputError, match="pair"):
             train("mlp", CAMERA, noise=noise)

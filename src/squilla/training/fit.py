@@ -133,7 +133,8 @@ def train(
         raise InputError(f"`{name}` is computed from the calibration and needs no training.")
     if count is None:
         count = LEARNT if kind.universal else EPOCH
-    if min(count, epochs, batch) < 1 or not 0 < learning_rate < math.inf:
+    sensible = min(count, epochs, batch) >= 1 and 0 < learning_rate < math.inf
+    if not (sensible or kind.universal):
         raise InputError(
             f"{epochs} epochs of {count} spectra in batches of {batch} at a learning rate of "
             f"{learning_rate:g} are no training; all four must be positive."
